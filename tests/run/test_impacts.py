@@ -337,6 +337,9 @@ def test_what_is_refused():
         dx.simulate(system, dx.DiscreteDirac(), x=[1.0, 0.0], step=0.05, steps=20, events=[FLOOR])
     with pytest.raises(ValueError, match="from 0 to 1"):
         dx.Impact(lambda q: q[0], restitution=1.5)
+    assert (
+        "the restitution from 0 to 1" in run(dx.Impact(lambda q: q[1], restitution=lambda t: 1.5 + 0 * t), v=[0.3, -2.0]).message
+    )
     with pytest.raises(TypeError, match="it takes v"):
         dx.Impact(lambda q, v: q[0])
     with pytest.raises(ValueError, match=r"under jax\.grad"):

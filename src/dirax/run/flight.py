@@ -230,7 +230,8 @@ class Flight:
         found = self.jumps[wall].one(state, t, self.search.problem.h)
         after, u, (speed, share) = found[:size], found[size:-2], found[-2:]
         if not np.all(np.isfinite(found)) or share < HELD:
-            why = "constraints hold it back" if share < HELD else "its jump is not finite: L must be regular there"
+            regular = "its jump is not finite: L must be regular there, and the restitution from 0 to 1"
+            why = "constraints hold it back" if share < HELD else regular
             self._end(f"events[{number}] was hit at t = {t:.6g}, and nothing can bounce off it: {why}")
             return None
         if speed >= 0.0:

@@ -9,7 +9,7 @@ import numpy as np
 from dirax.engines.contract import Problem
 from dirax.program.memo import Memo, Same, by_value
 from dirax.run.flight import Flight, alerted, fields_beside
-from dirax.run.impact import Impact, Numbers, gaps_of, jump
+from dirax.run.impact import Impact, Numbers, gaps_of, jump, restitutions_of
 from dirax.run.impact_search import ImpactSearch
 from dirax.schemes.collision_step import CollisionStep
 from dirax.schemes.step import StepEquation
@@ -31,14 +31,14 @@ class Flights:
             ("walls", *key, *walls),
             lambda: (
                 WatchedStep(stage, system, gaps).equation(),
-                CollisionStep(stage, system, gaps, tuple(wall.restitution for wall in walls)).equation(),
+                CollisionStep(stage, system, gaps, restitutions_of(walls)).equation(),
             ),
         )
         t, q, state = np.zeros(()), np.zeros(stage.state_layout["q"][0]), np.asarray(p.state)
         self.gap = Numbers(gaps, [t, q], p.params, "gaps", *walls)
         sizes = lambda t, q, end, params: gap_terms(gaps, t, q, [end], params)
         self.terms = Numbers(sizes, [t, q, q], p.params, "terms of gaps", *walls)
-        jumped = lambda wall: lambda state, t, h, params: jump(system, stage, wall, wall.restitution, state, t, h, params)
+        jumped = lambda wall: lambda state, t, h, params: jump(system, stage, wall, wall.restitution_at, state, t, h, params)
         self.jumps = [Numbers(jumped(wall), [state, t, t], p.params, "jump", *key, wall) for wall in walls]
         others = fields_beside(p)
 

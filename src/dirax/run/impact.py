@@ -7,23 +7,34 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from dirax.program.evaluation.functions import program_of
 from dirax.program.linear_solves import solve
 from dirax.program.tracing import once
+from dirax.program.user_functions import is_traced
 from dirax.run.event import OfMotion
+from dirax.run.scalars import is_number
 from dirax.schemes.collision_step import bounced, least_squares
 from dirax.schemes.step import StepEquation
+from dirax.text.representation import value_text
 
 KNOWN = ("t", "q", "params")
-"""What the gap may be given, by the names of its arguments."""
+"""What gap and restitution may be given, by the names of their arguments."""
+
+
+class Restitution(OfMotion):
+    """That of a wall, as a function of what is known of an impact."""
+
+    name = "the restitution of a dx.Impact"
 
 
 class Impact(OfMotion):
     """A wall: the motion bounces where `gap` becomes zero, `dx.simulate(…, events=[dx.Impact(gap, restitution=1.0)])`.
 
     `gap` returns one number of `q`, the time `t` and `params`, by the names of its arguments: positive off the wall.
-    `restitution` is e in [0, 1] of v⁺·n = −e v⁻·n, relative to a wall that moves.
+    `restitution` is e in [0, 1] of v⁺·n = −e v⁻·n, relative to a wall that moves: a number, or a function like the gap, so that
+    it may be one of the `params` that are fitted: `restitution=lambda params: params["e"]`.
 
     The step in which a wall is hit is divided (Fetecau, Marsden, Ortiz, West 2003): a step of the scheme of length αh that ends
     on the wall, α found with it; a jump of the momentum along ∂gap/∂q, and along the forces of constraints, so that these hold
@@ -50,24 +61,56 @@ class Impact(OfMotion):
     terminal = False
     name = "the gap of a dx.Impact"
 
-    def __init__(self, gap: Callable, restitution: float = 1.0):
-        number = not isinstance(restitution, bool) and isinstance(restitution, int | float | np.number)
-        if not number or not 0.0 <= restitution <= 1.0:
-            raise ValueError(f"restitution must be a number from 0 to 1, but {restitution!r} was given.")
-        self.restitution = float(restitution)
+    def __init__(self, gap: Callable, restitution: float | Callable = 1.0):
+        self.restitution = _restitution(restitution)
         super().__init__(gap, "gap", KNOWN, self.restitution)
 
     @property
     def works(self) -> bool:
-        """Whether it changes the energy: it moves, or does not give all of it back."""
-        return self.restitution < 1.0 or "t" in self.arguments
+        """Whether it changes the energy: it moves, or may not give all of it back."""
+        return self.restitution != 1.0 or "t" in self.arguments
+
+    @property
+    def functions(self) -> dict[str, Callable]:
+        """Its functions of (t, q, params), with what they are."""
+        return {"gap": self} | ({"restitution": self.restitution_at} if isinstance(self.restitution, Restitution) else {})
+
+    def hoisted(self, values: list[Tracer]) -> Any:
+        """The same of params that hold what its functions close over and JAX traces, which is added to `values`."""
+        other, law = super().hoisted(values), self.restitution
+        if not isinstance(law, Restitution) or (taken := law.hoisted(values)) is law:
+            return other
+        other = copy(other)
+        other.restitution, other.key = taken, (*other.key[:-1], taken)
+        return other
 
     def __call__(self, t: Any, q: Any, params: Any) -> Any:
         """The gap at one place."""
         return self.of({"t": t, "q": q, "params": params})
 
+    def restitution_at(self, t: Any, q: Any, params: Any) -> Any:
+        """The restitution at one place; NaN for one that is not in [0, 1]."""
+        if not isinstance(self.restitution, Restitution):
+            return self.restitution
+        e = self.restitution.of({"t": t, "q": q, "params": params})
+        return jnp.where((e >= 0.0) & (e <= 1.0), e, jnp.nan)
+
     def __repr__(self) -> str:
-        return f"Impact({self.signature}, restitution={self.restitution:g})"
+        law = self.restitution
+        return f"Impact({self.signature}, restitution={law.signature if isinstance(law, Restitution) else f'{law:g}'})"
+
+
+def _restitution(given: Any) -> float | Restitution:
+    """A number that JAX traces is a function, which hands it over with the params."""
+    if callable(given):
+        return Restitution(given, "restitution", KNOWN)
+    if is_number(given) and np.ndim(given) == 0 and not np.iscomplexobj(given):
+        if is_traced(given):
+            return Restitution(lambda t: given, "restitution", KNOWN)
+        if 0.0 <= given <= 1.0:
+            return float(given)
+    expected = "a number from 0 to 1, or a function of some of t, q, params by their names"
+    raise ValueError(f"restitution must be {expected}, but {value_text(given)} was given.")
 
 
 def gaps_of(walls: Sequence[Impact]) -> Callable:
@@ -79,17 +122,27 @@ def _gaps(walls: Sequence[Impact], t: Any, q: Any, params: Any) -> Any:
     return jnp.stack([jnp.asarray(wall(t, q, params), float) for wall in walls])
 
 
+def restitutions_of(walls: Sequence[Impact]) -> Callable:
+    """(t, q, params) ↦ the restitutions of all walls (walls,)."""
+    return once(_restitutions, tuple(walls))
+
+
+def _restitutions(walls: Sequence[Impact], t: Any, q: Any, params: Any) -> Any:
+    return jnp.stack([jnp.asarray(wall.restitution_at(t, q, params), float) for wall in walls])
+
+
 def jump(
-    system: Any, stage: StepEquation, gap: Callable, restitution: Any, state: Any, t: Any, h: Any, params: Any
+    system: Any, stage: StepEquation, gap: Callable, restitution: Callable, state: Any, t: Any, h: Any, params: Any
 ) -> tuple[Any, Any, Any, Any]:
-    """`bounced` off the wall of `gap(t, q, params)`, of constraints that may depend on each other."""
+    """`bounced` off the wall of `gap(t, q, params)` with `restitution(t, q, params)`, of constraints that may depend on each
+    other."""
     now, constraints = stage.state_layout.split(state), system.constraints
     v = system.complete({"q": now.q, "p": now.p, "t": t}, params, False)["v"]
     if constraints.any:
         rows = constraints.matrix(t, now.q, params)
         forces = solve(system.velocity_hessian(t, now.q, v, params), rows.T)
         v = v - forces @ least_squares(rows @ forces, constraints.velocity_defect(t, now.q, v, params))
-    return bounced(system, stage, lambda t, q: gap(t, q, params), restitution, state, v, t, h, params)
+    return bounced(system, stage, lambda t, q: gap(t, q, params), restitution(t, now.q, params), state, v, t, h, params)
 
 
 class Numbers:

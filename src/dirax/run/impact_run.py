@@ -1,6 +1,7 @@
 """A run with impacts: all its trajectories, and what is refused."""
 
 import time
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -83,8 +84,8 @@ def fly_all(settings: Any, begun: Any, walls: tuple[Impact, ...], numbers: tuple
 
 
 def check_walls(system: Any, p: Problem, walls: tuple[Impact, ...], numbers: tuple[int, ...]) -> bool:
-    """Whether a gap closes over values that JAX traces. Raises `TypeError` and `ValueError` for walls that these steps cannot
-    bounce off, and gaps that are none."""
+    """Whether a wall closes over values that JAX traces. Raises `TypeError` and `ValueError` for walls that these steps cannot
+    bounce off, and functions of them that are none."""
     stages = p.equation.stages
     layout = stages[0][0].state_layout
     if system.lagrangian_form() is None or len(stages) > 1 or not {"q", "p"} <= set(layout):
@@ -100,18 +101,25 @@ def check_walls(system: Any, p: Problem, walls: tuple[Impact, ...], numbers: tup
     own = jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], p.params) if p.batch_params else p.params
     traced = False
     for wall, number in zip(walls, numbers, strict=True):
-        try:
-            found, seen = captures_traced(f"the gap of events[{number}]", wall, t, q, own)
-        except OutsideIndex:
-            raise
-        except Exception as error:
-            raise TypeError(f"the gap of events[{number}] could not be traced by JAX: {error_text(error)}") from error
-        if not hasattr(found, "shape") or found.shape != ():
-            came = f"shape {found.shape}: index or sum its result" if hasattr(found, "shape") else type(found).__name__
-            raise ValueError(f"the gap of events[{number}] must return one number, but it returned {came}.")
-        if not jnp.issubdtype(found.dtype, jnp.floating):
-            raise TypeError(f"the gap of events[{number}] must return a real number (float64), but its dtype is {found.dtype}.")
-        traced = traced or seen
+        for what, function in wall.functions.items():
+            traced = _seen(f"the {what} of events[{number}]", function, t, q, own) or traced
+    return traced
+
+
+def _seen(what: str, function: Callable, *arguments: Any) -> bool:
+    """Whether a function of a wall closes over values that JAX traces. Raises `TypeError` and `ValueError` for one that returns
+    no number."""
+    try:
+        found, traced = captures_traced(what, function, *arguments)
+    except OutsideIndex:
+        raise
+    except Exception as error:
+        raise TypeError(f"{what} could not be traced by JAX: {error_text(error)}") from error
+    if not hasattr(found, "shape") or found.shape != ():
+        came = f"shape {found.shape}: index or sum its result" if hasattr(found, "shape") else type(found).__name__
+        raise ValueError(f"{what} must return one number, but it returned {came}.")
+    if not jnp.issubdtype(found.dtype, jnp.floating):
+        raise TypeError(f"{what} must return a real number (float64), but its dtype is {found.dtype}.")
     return traced
 
 

@@ -18,7 +18,7 @@ from dirax.engines.parameters import parameters
 from dirax.engines.xla.lane import passing
 from dirax.engines.xla.newton import as_function
 from dirax.program.interpreter import UnsupportedPrimitive
-from dirax.run.impact import Impact, gaps_of, jump
+from dirax.run.impact import Impact, gaps_of, jump, restitutions_of
 from dirax.run.impact_on_host import FlightsOnHost
 from dirax.run.result import solution_of
 from dirax.run.step_parts import StepParts
@@ -114,8 +114,8 @@ class TracedFlight:
 
     def _bounced(self, state, u, wall, t, h, params):
         """The state after an impact, and a guess of the unknowns after it."""
-        gap, restitution = gaps_of(self.walls), jnp.array([one.restitution for one in self.walls])[wall]
-        own = lambda t, q, params: gap(t, q, params)[wall]
+        of_walls = gaps_of(self.walls), restitutions_of(self.walls)
+        own, restitution = (lambda t, q, params, of=of: of(t, q, params)[wall] for of in of_walls)
         after, guess, _, _ = jump(self.system, self.equation, own, restitution, state, self.time(state, t), h, params)
         return after, jax.lax.stop_gradient(guess)
 

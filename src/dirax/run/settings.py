@@ -58,7 +58,8 @@ class Settings:
     def reads(self) -> list[tuple[str, Captured]]:
         """What the functions of this system and scheme, and of these events, read from outside, which may have changed where
         that of others that are equal has not."""
-        stated = self.system, self.scheme, *self.events
+        walls = (event.restitution for event in self.events if isinstance(event, Impact))
+        stated = self.system, self.scheme, *self.events, *walls
         return _reads.get(tuple(map(Same, stated)), lambda: list(functions_in(stated)))
 
     @cached_property

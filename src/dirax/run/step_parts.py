@@ -14,7 +14,7 @@ from dirax.engines.parameters import Parameters
 from dirax.engines.xla.newton import as_function
 from dirax.program.memo import Same, by_value
 from dirax.program.on_host import host_program, on_host
-from dirax.run.impact import Impact, gaps_of, jump
+from dirax.run.impact import Impact, gaps_of, jump, restitutions_of
 from dirax.schemes.step import CLOCK, StepEquation
 
 KNOWN = 2
@@ -73,7 +73,7 @@ class StepParts:
         args = state, at, t, h, params = self._split(x)
         z = as_function(residual, jnp.append(known[:-2], length), args)
         there, over = stage.advance(*step(z, *args)), at + z[-1]
-        own, restitution = lambda t, q, params: of_wall(gaps(t, q, params)), of_wall([wall.restitution for wall in self.walls])
+        own, restitution = (lambda t, q, params, of=of: of_wall(of(t, q, params)) for of in (gaps, restitutions_of(self.walls)))
         after = jump(self.system, stage, own, restitution, there, time(there, t + over * h), h, params)[0]
         return jnp.append(after, over), self._row(state, z[:-1], t + at * h, z[-1] * h, params)
 

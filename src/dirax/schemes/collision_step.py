@@ -41,7 +41,8 @@ class CollisionStep(AbstractStep):
     inner: StepEquation
     system: Any
     gaps: Callable
-    restitutions: tuple[float, ...]
+    restitutions: Callable
+    """(t, q, params) ↦ (walls,), like the gaps."""
 
     @property
     def state(self) -> Layout:
@@ -83,7 +84,7 @@ class CollisionStep(AbstractStep):
         begun, end = (vector[self.inner.state_layout.place("q")] for vector in (state, there))
         small = ON_WALL * gap_terms(self.gaps, time, end, [begun], params)
         good = (u[-1] > 0.0) & (u[-1] <= 1.0) & (speed < 0.0) & (share > HELD)
-        for i in range(len(self.restitutions)):
+        for i in range(gaps.shape[0]):
             good = good & ((state[-2] == i) | (gaps[i] >= -small[i]))
         return jnp.concatenate([jnp.where(good, after, jnp.nan), jnp.stack([state[-3], state[-2], u[-1]])])
 
@@ -94,7 +95,8 @@ class CollisionStep(AbstractStep):
 
     @once
     def _jumped(self, u, state, there, time, h, params):
-        now, restitution = self.inner.state_layout.split(there), self._own(state[-2], self.restitutions)
+        now = self.inner.state_layout.split(there)
+        restitution = self._own(state[-2], self.restitutions(time, now.q, params))
         begun = self.inner.state_layout.split(state[:-3])
         about = (now.q - begun.q) / (u[-1] * h)
         gap = lambda t, q: self._own(state[-2], self.gaps(t, q, params))
@@ -103,7 +105,7 @@ class CollisionStep(AbstractStep):
 
     def _own(self, wall, values):
         """The entry of a wall's number."""
-        return sum(jnp.where(wall == i, values[i], 0.0) for i in range(len(self.restitutions)))
+        return sum(jnp.where(wall == i, values[i], 0.0) for i in range(values.shape[0]))
 
 
 def least_squares(matrix: Any, right: Any) -> Any:
