@@ -160,3 +160,27 @@ def test_a_lagrangian_form_is_enough(method):
     known = dx.simulate(springs.lagrangian_form(), dx.DiscreteDirac(), **run)
     assert np.array_equal(own.q, known.q) and np.array_equal(own.p, known.p)
     assert dx.verify(own).ok
+
+
+@pytest.mark.parametrize(
+    ("method", "wrong", "said"),
+    [
+        ("sizes", lambda self, data, params: 1, "sizes of .* must return .n, m. or .n, m, c., .* not 1"),
+        (
+            "complete",
+            lambda self, data, params, project: {"x": data["x"]},
+            "must return a dict with x, velocity, but it returned x",
+        ),
+        ("complete", lambda self, data, params, project: data["y"], r"complete of .* could not be traced by JAX: KeyError: 'y'"),
+        ("relation_form", lambda self, shape: dx.RelationForm(lambda x, v, u, t, params: v[:1]), r"6 numbers .* of shape \(1,\)"),
+        (
+            "relation_form",
+            lambda self, shape: dx.RelationForm(lambda x, v, u, t, params: [v, x]),
+            r"6 numbers .* it returned a list",
+        ),
+    ],
+)
+def test_methods_that_return_something_else_are_named(method, wrong, said):
+    kind = type("Wrong", (Still,), {method: wrong, "__module__": __name__})
+    with pytest.raises((TypeError, ValueError), match=said):
+        dx.simulate(kind(valley, JOINT), dx.DiscreteDirac(), x=START, step=0.1, steps=1)

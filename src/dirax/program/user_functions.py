@@ -159,10 +159,8 @@ class UserFunction(eqx.Module):
         try:
             jaxpr, out = jax.make_jaxpr(lambda *v: self(*v), return_shape=True)(*values)
         except Exception as error:
-            way = _way_out(error, values[-1] if self.takes_params else None)
-            raise TypeError(
-                f"{self._call} could not be traced by JAX{self._on(values)}: {type(error).__name__}: {_first_line(error)}{way}"
-            ) from error
+            why = why_untraced(error, values[-1] if self.takes_params else None)
+            raise TypeError(f"{self._call} could not be traced by JAX{self._on(values)}: {why}") from error
         if not isinstance(out, jax.ShapeDtypeStruct) or out.dtype != jnp.float64:
             what = f"dtype {out.dtype}: convert it with .astype(float)" if hasattr(out, "dtype") else type(out).__name__
             raise TypeError(f"{self._call} must return one array of real numbers (float64), but it returned {what}.")
@@ -279,6 +277,11 @@ def _shapes_of(values: tuple) -> str:
 
 def _first_line(message: Any) -> str:
     return (str(message).splitlines() or ["no message"])[0].split(" (`")[0].rstrip(". ")
+
+
+def why_untraced(error: Exception, params: Any) -> str:
+    """What a function of params that JAX does not trace has raised, and the way out."""
+    return f"{type(error).__name__}: {_first_line(error)}{_way_out(error, params)}"
 
 
 def _way_out(error: Exception, params: Any) -> str:

@@ -24,7 +24,7 @@ from dirax.run.final_manifold import (
     refuse_off_final_manifold,
     warn_of_leaving,
 )
-from dirax.run.own_equation import refuse_wrong_shapes
+from dirax.run.own_equation import refuse_wrong_shapes, shape_of
 from dirax.run.plan import AnyPlan, planned
 from dirax.run.premises import bytes_of, check_premise
 from dirax.run.progress import reported, reporting
@@ -201,7 +201,7 @@ def _begun(settings: Settings, case: Case, steps: int, save_every: int, asked: i
     data, own = case.first
     # discretize: constraints that follow from others at the completed data are left out of the equation
     with values_matter() as by_values:
-        shape, redundant, singular = Shape(*system.sizes(data, own)), case.redundant, False
+        shape, redundant, singular = shape_of(system, data, own), case.redundant, False
     if not case.traced:
         check_premise(system, case)
     initial = completed(system, case, settings.project, by_jax)

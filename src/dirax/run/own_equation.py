@@ -1,4 +1,5 @@
-"""What the functions of a step equation of one's own return, asked once: shapes, names and kinds of numbers."""
+"""What the functions of a system and of a step equation of one's own return, asked before they are used: shapes, names and kinds
+of numbers."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -6,10 +7,55 @@ from typing import Any
 import jax
 import numpy as np
 
+from dirax.numerics.arrays import is_whole
 from dirax.program.memo import Memo, Same
+from dirax.program.user_functions import why_untraced
 from dirax.schemes.step import StepEquation
+from dirax.systems.shape import Shape
+
+COMPLETE = {"x": ("x", "velocity"), "q": ("q", "v", "p"), "q0": ("q0", "q1")}
+"""What completed data hold of those that are given."""
 
 _asked: Memo[bool] = Memo(64)
+
+
+def shape_of(system: Any, data: Mapping[str, Any], params: Any) -> Shape:
+    """The sizes of a system with these data of one trajectory. Raises `TypeError` and `ValueError` where a
+    method of one that is not dirax's own returns what it should not."""
+    sizes = system.sizes(data, params)
+    if type(system).__module__.startswith("dirax."):
+        return Shape(*sizes)
+    name = type(system).__name__
+    if not isinstance(sizes, tuple | list) or len(sizes) not in (2, 3) or not all(is_whole(size) and size >= 0 for size in sizes):
+        raise TypeError(
+            f"sizes of {name} must return (n, m) or (n, m, c), numbers of coordinates and constraints, not {sizes!r:.60}."
+        )
+    shape, data = Shape(*map(int, sizes)), {**data, "t": jax.ShapeDtypeStruct((), np.float64)}
+    complete = _returned(f"complete of {name}", lambda data, params: system.complete(data, params, False), data, params)
+    needed = next((names for given, names in COMPLETE.items() if given in data), ())
+    if not isinstance(complete, Mapping) or not set(needed) <= set(complete):
+        held = ", ".join(complete) if isinstance(complete, Mapping) else _said(complete)
+        raise ValueError(f"complete of {name} must return a dict with {', '.join(needed)}, but it returned {held}.")
+    relation = system.relation_form(shape)
+    if relation is not None and "x" in complete:
+        x, u = complete["x"], jax.ShapeDtypeStruct((relation.multipliers,), np.float64)
+        found = _returned(f"the relation of {name}", relation.residual, x, x, u, data["t"], params)
+        size = x.shape[0] + relation.multipliers
+        if not _is_vector(found, size):
+            needed = f"{size} numbers in float64, one of each coordinate and multiplier"
+            raise ValueError(f"the relation of {name} must return {needed}, but it returned {_said(found)}.")
+    return shape
+
+
+def _returned(what: str, function: Callable, *arguments: Any) -> Any:
+    """The shapes of what a user's function returns, whose last argument are params. Raises `TypeError` for one that JAX does not
+    trace; a `ValueError` is its own."""
+    try:
+        return jax.eval_shape(function, *arguments)
+    except ValueError:
+        raise
+    except Exception as error:
+        raise TypeError(f"{what} could not be traced by JAX: {why_untraced(error, arguments[-1])}") from error
 
 
 def refuse_wrong_shapes(equation: Any, data: Mapping[str, Any], h: Any, params: Any) -> None:
@@ -27,19 +73,18 @@ def _is_known(function: Callable) -> bool:
 def _ask(stage: StepEquation, data: Mapping[str, Any], h: Any, params: Any) -> bool:
     vector = lambda size: jax.ShapeDtypeStruct((size,), np.float64)
     number, x, u = jax.ShapeDtypeStruct((), np.float64), vector(stage.state_size), vector(stage.unknowns)
-    begun = jax.eval_shape(stage.start, dict(data), h, params)
+    begun = _returned("start of the step equation", stage.start, dict(data), h, params)
     if not isinstance(begun, tuple | list) or len(begun) != 2:
         raise ValueError(
             f"start of the step equation must return two vectors, (state, first guess), but it returned {_said(begun)}."
         )
     _refuse("start", begun[0], stage.state_size, "the state", "state_size")
     _refuse("start", begun[1], stage.unknowns, "the first guess", "unknowns")
-    _refuse("residual", jax.eval_shape(stage.residual, u, x, number, number, params), stage.unknowns, "r", "unknowns")
-    _refuse(
-        "advance", jax.eval_shape(stage.advance, u, x, number, number, params), stage.state_size, "the next state", "state_size"
-    )
-    _refuse("guess", jax.eval_shape(stage.guess, x, u, number, params), stage.unknowns, "the unknowns", "unknowns")
-    row = jax.eval_shape(stage.unpack, x, u, number, number, params)
+    asked = lambda name, *arguments: _returned(f"{name} of the step equation", getattr(stage, name), *arguments, params)
+    _refuse("residual", asked("residual", u, x, number, number), stage.unknowns, "r", "unknowns")
+    _refuse("advance", asked("advance", u, x, number, number), stage.state_size, "the next state", "state_size")
+    _refuse("guess", asked("guess", x, u, number), stage.unknowns, "the unknowns", "unknowns")
+    row = asked("unpack", x, u, number, number)
     if not isinstance(row, Mapping) or set(row) != set(stage.fields):
         held = ", ".join(row) if isinstance(row, Mapping) else _said(row)
         raise ValueError(
@@ -55,12 +100,18 @@ def _ask(stage: StepEquation, data: Mapping[str, Any], h: Any, params: Any) -> b
 
 
 def _refuse(function: str, found: Any, size: int, what: str, named: str) -> None:
-    if not hasattr(found, "dtype") or found.shape != (size,) or found.dtype != np.float64:
+    if not _is_vector(found, size):
         raise ValueError(
             f"{function} of the step equation must return {what} of shape ({size},) in float64, as {named}={size} says, but it "
             f"returned {_said(found)}."
         )
 
 
+def _is_vector(found: Any, size: int) -> bool:
+    return hasattr(found, "dtype") and found.shape == (size,) and found.dtype == np.float64
+
+
 def _said(found: Any) -> str:
-    return f"{found.dtype} of shape {found.shape}" if hasattr(found, "dtype") else f"{found!r:.60}"
+    if hasattr(found, "dtype"):
+        return f"{found.dtype} of shape {found.shape}"
+    return "None" if found is None else f"a {type(found).__name__}"
