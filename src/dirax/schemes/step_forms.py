@@ -210,7 +210,9 @@ def form_of_steps(
     if (on_manifold := system.manifold_form()) is not None:
         if "chart" in fields:
             return ChartedForm(system, step)
-        if isinstance(on_manifold.manifold, AbstractGeodesicManifold) and list(first.state_layout)[:2] == ["q", "p"]:
+        if not isinstance(on_manifold.manifold, AbstractGeodesicManifold):
+            return f"dq ∧ dp is measured in the chart of a retraction, and {on_manifold.manifold} has none"
+        if list(first.state_layout)[:2] == ["q", "p"]:
             return AmbientForm(system, step)
     if not isinstance(structure, str) and structure.curved(shape.n):
         return "the points x are on a curved submanifold of R^N, and the derivative of a step is one by all of R^N"
