@@ -209,6 +209,44 @@ def test_reverse_mode_and_second_derivatives():
     np.testing.assert_allclose(found, jax.jvp(jax.grad(exact), (at,), (along,)), rtol=1e-10)
 
 
+class Summing(dx.AbstractScheme):
+    """Free flight, and on the side a sum of q over the steps, with which a step that leaves a row goes on."""
+
+    def step_equation(self, system, shape):
+        layout, nothing = dx.Layout(q=1, p=1, sum=()), jnp.zeros(0)
+
+        def advance(u, x, t, h, params):
+            q, p, so_far = layout.split(x)
+            return layout.join(q=q + h * p, p=p, sum=so_far + h * q[0])
+
+        return dx.StepEquation(
+            start=lambda data, h, params: (layout.join(q=data["q"], p=data["p"], sum=0.0), nothing),
+            resume=lambda data, h, params: (layout.join(**{name: data[name] for name in layout}), nothing),
+            residual=lambda u, x, t, h, params: nothing,
+            advance=advance,
+            unpack=lambda x, u, t, h, params: layout.split(x)._asdict(),
+            state_layout=layout,
+            unknowns=0,
+            fields={"q": dx.Field((1,)), "p": dx.Field((1,)), "sum": dx.Field(())},
+        )
+
+
+def test_own_fields_of_a_scheme_go_through_a_wall():
+    """q begins at 1 with the velocity −v; of four steps the third one is divided by the wall at 0, which is hit at 1/v."""
+    free, wall = dx.LagrangeDirac(lambda q, v: v @ v / 2), dx.Impact(lambda q: q[0])
+
+    def summed(v):
+        run = dx.simulate(free, Summing(), q=jnp.ones(1), v=-v[None], step=0.5, steps=4, events=[wall])
+        return run.fields["sum"][-1]
+
+    def exact(v):
+        onto, after = 1 / v - 1.0, 1.5 - 1 / v  # lengths of the parts of the third step
+        return 0.5 + 0.5 * (1 - v / 2) + onto * (1 - v) + 0.5 * after * v
+
+    at = jnp.array(0.75)
+    np.testing.assert_allclose(jax.value_and_grad(summed)(at), jax.value_and_grad(exact)(at), rtol=1e-12)
+
+
 def test_the_step_is_in_one_place_however_many_walls_there_are():
     """XLA compiles every copy of it, which took half a minute."""
     ball, scheme = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[0]), dx.LagrangeDAlembert()

@@ -10,7 +10,7 @@ from dirax.engines.contract import Problem
 from dirax.program.memo import Memo, Same
 from dirax.run.flight import Flight, Part
 from dirax.run.flights import Flights, behind
-from dirax.schemes.step import Field, StepEquation
+from dirax.schemes.step import Field, RowAtState, StepEquation
 from dirax.schemes.watched_step import NONE
 
 MOST = 4
@@ -34,7 +34,12 @@ def recording(equation: StepEquation) -> StepEquation:
         "length": Field((), "step"),
     }
     unpack = lambda state, u, t, h, params: {"state": state, "unknowns": u, "length": jnp.asarray(h, float)}
-    return _recordings.get(Same(equation), lambda: replace(equation, unpack=unpack, fields=fields))
+
+    def resume(data, h, params):
+        row = lambda: equation.unpack(data["state"], jnp.zeros(equation.unknowns), data["t"], h, params)
+        return equation.resume(RowAtState(data, row), h, params)
+
+    return _recordings.get(Same(equation), lambda: replace(equation, unpack=unpack, fields=fields, resume=resume))
 
 
 class Flown(NamedTuple):
