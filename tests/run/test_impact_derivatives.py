@@ -210,7 +210,9 @@ def test_reverse_mode_and_second_derivatives():
 
 
 class Summing(dx.AbstractScheme):
-    """Free flight, and on the side a sum of q over the steps, with which a step that leaves a row goes on."""
+    """Free flight, and on the side a sum of q over the steps, with which a step that leaves a row goes on if it is `resumed`."""
+
+    resumed: bool = True
 
     def step_equation(self, system, shape):
         layout, nothing = dx.Layout(q=1, p=1, sum=()), jnp.zeros(0)
@@ -221,7 +223,9 @@ class Summing(dx.AbstractScheme):
 
         return dx.StepEquation(
             start=lambda data, h, params: (layout.join(q=data["q"], p=data["p"], sum=0.0), nothing),
-            resume=lambda data, h, params: (layout.join(**{name: data[name] for name in layout}), nothing),
+            resume=(lambda data, h, params: (layout.join(**{name: data[name] for name in layout}), nothing))
+            if self.resumed
+            else None,
             residual=lambda u, x, t, h, params: nothing,
             advance=advance,
             unpack=lambda x, u, t, h, params: layout.split(x)._asdict(),
@@ -235,8 +239,8 @@ def test_own_fields_of_a_scheme_go_through_a_wall():
     """q begins at 1 with the velocity −v; of four steps the third one is divided by the wall at 0, which is hit at 1/v."""
     free, wall = dx.LagrangeDirac(lambda q, v: v @ v / 2), dx.Impact(lambda q: q[0])
 
-    def summed(v):
-        run = dx.simulate(free, Summing(), q=jnp.ones(1), v=-v[None], step=0.5, steps=4, events=[wall])
+    def summed(v, scheme=Summing()):
+        run = dx.simulate(free, scheme, q=jnp.ones(1), v=-v[None], step=0.5, steps=4, events=[wall])
         return run.fields["sum"][-1]
 
     def exact(v):
@@ -245,6 +249,9 @@ def test_own_fields_of_a_scheme_go_through_a_wall():
 
     at = jnp.array(0.75)
     np.testing.assert_allclose(jax.value_and_grad(summed)(at), jax.value_and_grad(exact)(at), rtol=1e-12)
+    for run in (summed, jax.grad(summed)):
+        with pytest.raises(ValueError, match=r"does not say how the step that leaves .* begins.* start\(\) .*sum.*resume="):
+            run(at, Summing(resumed=False))
 
 
 def test_the_step_is_in_one_place_however_many_walls_there_are():

@@ -2,8 +2,11 @@
 
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
+from dirax.program.user_functions import constant_entries
+from dirax.schemes.step import StepEquation
 from dirax.solution.trajectory import last_rows
 
 RESUMED = 1e-6
@@ -39,3 +42,21 @@ def refuse_restarting(again: Any) -> None:
                 f"from row {row} to {name} = {came}, where the run has {expected}: give dx.StepEquation(resume=…), a function of "
                 f"(data, h, params) that makes the state of what is saved, such as data[{name!r}]."
             )
+
+
+def refuse_sums(equation: StepEquation, params: Any) -> None:
+    """Raise `ValueError` where an equation without `resume` starts a part of its state with the same numbers everywhere, which
+    steps change: all that is known of one whose values JAX traces."""
+    q = np.zeros(equation.state_layout["q"])
+    data, number, u = {"q": q, "v": q, "p": q, "t": np.zeros(())}, np.ones(()), np.zeros(equation.unknowns)
+    begins = constant_entries(lambda *given: equation.start(*given)[0], data, number, params)
+    if begins is None or not np.any(fixed := np.isfinite(begins)):
+        return
+    goes_on = lambda x, *given: equation.advance(u, jnp.where(fixed, begins, x), *given)[np.flatnonzero(fixed)]
+    after = constant_entries(goes_on, np.zeros(equation.state_size), number, number, params)
+    if after is None or not np.array_equal(after, begins[fixed]):
+        names = ", ".join(name for name in equation.state_layout if np.any(fixed[equation.state_layout.place(name)]))
+        raise ValueError(
+            f"the equation does not say how the step that leaves a wall begins, and its start() has the same {names} everywhere: "
+            "give dx.StepEquation(resume=…), a function of (data, h, params) that makes the state of what is saved."
+        )
