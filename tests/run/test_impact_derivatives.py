@@ -212,10 +212,13 @@ def test_reverse_mode_and_second_derivatives():
 class Summing(dx.AbstractScheme):
     """Free flight, and on the side a sum of q over the steps, with which a step that leaves a row goes on if it is `resumed`."""
 
-    resumed: bool = True
+    resumed: bool | None = True
 
     def step_equation(self, system, shape):
         layout, nothing = dx.Layout(q=1, p=1, sum=()), jnp.zeros(0)
+
+        def resume(data, h, params):
+            return layout.join(q=data["q"], p=data["p"], sum=data["sum"] if self.resumed else 0.0), nothing
 
         def advance(u, x, t, h, params):
             q, p, so_far = layout.split(x)
@@ -223,9 +226,7 @@ class Summing(dx.AbstractScheme):
 
         return dx.StepEquation(
             start=lambda data, h, params: (layout.join(q=data["q"], p=data["p"], sum=0.0), nothing),
-            resume=(lambda data, h, params: (layout.join(**{name: data[name] for name in layout}), nothing))
-            if self.resumed
-            else None,
+            resume=None if self.resumed is None else resume,
             residual=lambda u, x, t, h, params: nothing,
             advance=advance,
             unpack=lambda x, u, t, h, params: layout.split(x)._asdict(),
@@ -249,9 +250,12 @@ def test_own_fields_of_a_scheme_go_through_a_wall():
 
     at = jnp.array(0.75)
     np.testing.assert_allclose(jax.value_and_grad(summed)(at), jax.value_and_grad(exact)(at), rtol=1e-12)
+    says = "how the step that leaves .* begins"
     for run in (summed, jax.grad(summed)):
-        with pytest.raises(ValueError, match=r"does not say how the step that leaves .* begins.* start\(\) .*sum.*resume="):
-            run(at, Summing(resumed=False))
+        with pytest.raises(ValueError, match=rf"does not say {says}.* start\(\) .*sum.*resume="):
+            run(at, Summing(resumed=None))
+    with pytest.raises(ValueError, match=rf"says {says}.* but its resume\(\) leads .* to sum = 0\.125"):
+        summed(at, Summing(resumed=False))
 
 
 def test_the_step_is_in_one_place_however_many_walls_there_are():

@@ -19,7 +19,7 @@ from dirax.run.redundancy import without_redundant
 from dirax.run.traced_run import carried_by_jax
 from dirax.solution.dense import Dense
 from dirax.solution.events import Events, joined
-from dirax.solution.restarts import refuse_restarting, refuse_sums
+from dirax.solution.restarts import refuse_restarting, refuse_sums, resumes_in_its_own_way
 from dirax.solution.solution import Solution
 
 FIRST_STEPS = 3
@@ -246,9 +246,9 @@ def run_with_events(
             begun = begin(plain, case, count, 1, 1)
             captured = check_walls(plain.system, begun.problem, own, tuple(walls))
             first = begun.problem.equation.stages[0][0]
-            if first.resume is first.start and (begun.traced or captured):
+            if begun.traced or captured:
                 refuse_sums(first, begun.problem.params)
-            elif first.resume is first.start:
+            elif resumes_in_its_own_way(first):
                 refuse_restarting(Dense(carry_out(plain, case, min(count, FIRST_STEPS), 1, False)).again)
             return begun, captured
 

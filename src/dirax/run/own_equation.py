@@ -9,6 +9,7 @@ import numpy as np
 
 from dirax.numerics.arrays import is_whole
 from dirax.program.memo import Memo, Same
+from dirax.program.outside_values import package_of
 from dirax.program.user_functions import why_untraced
 from dirax.schemes.step import StepEquation
 from dirax.systems.shape import Shape
@@ -62,24 +63,24 @@ def refuse_wrong_shapes(equation: Any, data: Mapping[str, Any], h: Any, params: 
     """Raise `ValueError` where a function of a stage that is not dirax's own returns what its sizes and fields do not say; `data`
     are the complete ones of one trajectory."""
     for stage, _ in equation.stages:
-        if not _is_known(stage.residual):
+        if package_of(stage.residual) != "dirax":
             _asked.get(Same(stage), lambda stage=stage: _ask(stage, data, h, params))
-
-
-def _is_known(function: Callable) -> bool:
-    return (getattr(getattr(function, "__func__", function), "__module__", None) or "").startswith("dirax.")
 
 
 def _ask(stage: StepEquation, data: Mapping[str, Any], h: Any, params: Any) -> bool:
     vector = lambda size: jax.ShapeDtypeStruct((size,), np.float64)
     number, x, u = jax.ShapeDtypeStruct((), np.float64), vector(stage.state_size), vector(stage.unknowns)
-    begun = _returned("start of the step equation", stage.start, dict(data), h, params)
-    if not isinstance(begun, tuple | list) or len(begun) != 2:
-        raise ValueError(
-            f"start of the step equation must return two vectors, (state, first guess), but it returned {_said(begun)}."
-        )
-    _refuse("start", begun[0], stage.state_size, "the state", "state_size")
-    _refuse("start", begun[1], stage.unknowns, "the first guess", "unknowns")
+    begins = {"start": dict(data)}
+    if stage.resume is not stage.start:
+        begins["resume"] = {**data, **{name: jax.ShapeDtypeStruct(f.shape, np.float64) for name, f in stage.fields.items()}}
+    for name, known in begins.items():
+        begun = _returned(f"{name} of the step equation", getattr(stage, name), known, h, params)
+        if not isinstance(begun, tuple | list) or len(begun) != 2:
+            raise ValueError(
+                f"{name} of the step equation must return two vectors, (state, first guess), but it returned {_said(begun)}."
+            )
+        _refuse(name, begun[0], stage.state_size, "the state", "state_size")
+        _refuse(name, begun[1], stage.unknowns, "the first guess", "unknowns")
     asked = lambda name, *arguments: _returned(f"{name} of the step equation", getattr(stage, name), *arguments, params)
     _refuse("residual", asked("residual", u, x, number, number), stage.unknowns, "r", "unknowns")
     _refuse("advance", asked("advance", u, x, number, number), stage.state_size, "the next state", "state_size")

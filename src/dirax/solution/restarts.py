@@ -1,10 +1,12 @@
-"""Equations that do not say how a step is resumed, and whose start does not do it: a sum of theirs would begin again."""
+"""Equations that do not say how a step is resumed, and whose start does not do it, or that say it wrongly: a sum of theirs would
+begin again."""
 
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
+from dirax.program.outside_values import package_of
 from dirax.program.user_functions import constant_entries
 from dirax.schemes.step import StepEquation
 from dirax.solution.trajectory import last_rows
@@ -17,10 +19,10 @@ FEW = 100
 
 
 def refuse_restarting(again: Any) -> None:
-    """Raise `ValueError` where steps from the last row but one do not lead to the last one, and the equation has no `resume`;
+    """Raise `ValueError` where steps from the last row but one do not lead to the last one, by an equation that is a user's own;
     `again` are the steps of a run once more, a `StepsAgain`."""
     sol, (first, _) = again.sol, again.equation.stages[0]
-    if first.resume is not first.start or sol.impacts is not None:
+    if not resumes_in_its_own_way(first) or sol.impacts is not None:
         return
     nodes = {name: np.asarray(a) for name, a in sol.fields.items() if sol.field_info[name].place == "node"}
     nodes = nodes if sol.batch is not None else {name: a[None] for name, a in nodes.items()}
@@ -37,16 +39,25 @@ def refuse_restarting(again: Any) -> None:
         there, size = nodes[name][0, row + 1], np.nanmax(np.abs(nodes[name][0]), initial=0.0)
         if not np.all(np.abs(made[0] - there) <= RESUMED * size):
             came, expected = (np.array2string(a, precision=6) for a in (made[0], there))
+            silent = first.resume is first.start
+            says = f"{'does not say' if silent else 'says'} how the step that leaves a saved row begins"
             raise ValueError(
-                f"the equation of {sol.scheme!r} does not say how the step that leaves a saved row begins, and its start() leads "
+                f"the equation of {sol.scheme!r} {says}, {'and its start()' if silent else 'but its resume()'} leads "
                 f"from row {row} to {name} = {came}, where the run has {expected}: give dx.StepEquation(resume=…), a function of "
                 f"(data, h, params) that makes the state of what is saved, such as data[{name!r}]."
             )
 
 
+def resumes_in_its_own_way(equation: StepEquation) -> bool:
+    """Whether steps that leave rows begin by a user's function."""
+    return package_of(equation.resume) != "dirax"
+
+
 def refuse_sums(equation: StepEquation, params: Any) -> None:
     """Raise `ValueError` where an equation without `resume` starts a part of its state with the same numbers everywhere, which
     steps change: all that is known of one whose values JAX traces."""
+    if equation.resume is not equation.start:
+        return
     q = np.zeros(equation.state_layout["q"])
     data, number, u = {"q": q, "v": q, "p": q, "t": np.zeros(())}, np.ones(()), np.zeros(equation.unknowns)
     begins = constant_entries(lambda *given: equation.start(*given)[0], data, number, params)
