@@ -251,7 +251,8 @@ def test_own_fields_of_a_scheme_go_through_a_wall():
     at = jnp.array(0.75)
     np.testing.assert_allclose(jax.value_and_grad(summed)(at), jax.value_and_grad(exact)(at), rtol=1e-12)
     says = "how the step that leaves .* begins"
-    for run in (summed, jax.grad(summed)):
+    between = lambda v, scheme: dx.simulate(free, scheme, q=jnp.ones(1), v=-v[None], step=0.5, steps=4).at(0.3).q[0]
+    for run in (summed, jax.grad(summed), jax.grad(between)):
         with pytest.raises(ValueError, match=rf"does not say {says}.* start\(\) .*sum.*resume="):
             run(at, Summing(resumed=None))
     with pytest.raises(ValueError, match=rf"says {says}.* but its resume\(\) leads .* to sum = 0\.125"):

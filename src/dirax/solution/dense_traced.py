@@ -10,6 +10,7 @@ from dirax.program.memo import Same, by_value
 from dirax.schemes.step import CLOCK, STEP_DENSITY
 from dirax.solution.between_rows import BetweenRows, velocity_of
 from dirax.solution.divided_steps import AT_ROW, step_for
+from dirax.solution.restarts import refuse_sums
 from dirax.solution.steps_again import Keyed, begun, compiled_call, row_of, stepped, with_roots
 
 
@@ -65,6 +66,7 @@ class TracedDense(BetweenRows):
         if self.interpolate is None and self.between is not None:
             about = {"about": (after["q"] - row["q"]) / length}
             return tuple(velocity_of(self.sol.system, a | about, s, params) for a, s in ((row, begins), (after, ends)))
+        refuse_sums(self.equation.stages[0][0], params)
         state, guess = begun(self.equation, self.sol.system, row | of_step, begins, h, params)
         return state, guess if self.interpolate is None else self._step(roots, 0, state, guess, begins, h, params)[1]
 

@@ -56,18 +56,22 @@ def resumes_in_its_own_way(equation: StepEquation) -> bool:
 def refuse_sums(equation: StepEquation, params: Any) -> None:
     """Raise `ValueError` where an equation without `resume` starts a part of its state with the same numbers everywhere, which
     steps change: all that is known of one whose values JAX traces."""
-    if equation.resume is not equation.start:
+    names = ("q", "v", "p") if "q" in equation.fields else ("x", "velocity")
+    if equation.resume is not equation.start or names[0] not in equation.fields:
         return
-    q = np.zeros(equation.state_layout["q"])
-    data, number, u = {"q": q, "v": q, "p": q, "t": np.zeros(())}, np.ones(()), np.zeros(equation.unknowns)
-    begins = constant_entries(lambda *given: equation.start(*given)[0], data, number, params)
+    data = dict.fromkeys(names, np.zeros(equation.fields[names[0]].shape)) | {"t": np.zeros(())}
+    number, x, u = np.ones(()), np.zeros(equation.state_size), np.zeros(equation.unknowns)
+    try:
+        begins = constant_entries(lambda *given: equation.start(*given)[0], data, number, params)
+    except KeyError:  # it starts from something else
+        return
     if begins is None or not np.any(fixed := np.isfinite(begins)):
         return
-    goes_on = lambda x, *given: equation.advance(u, jnp.where(fixed, begins, x), *given)[np.flatnonzero(fixed)]
-    after = constant_entries(goes_on, np.zeros(equation.state_size), number, number, params)
+    goes_on = lambda x, u, *given: equation.advance(u, jnp.where(fixed, begins, x), *given)[np.flatnonzero(fixed)]
+    after = constant_entries(goes_on, x, u, number, number, params)
     if after is None or not np.array_equal(after, begins[fixed]):
         names = ", ".join(name for name in equation.state_layout if np.any(fixed[equation.state_layout.place(name)]))
         raise ValueError(
-            f"the equation does not say how the step that leaves a wall begins, and its start() has the same {names} everywhere: "
-            "give dx.StepEquation(resume=…), a function of (data, h, params) that makes the state of what is saved."
+            f"the equation does not say how the step that leaves a row or a wall begins, and its start() has the same {names} "
+            "everywhere: give dx.StepEquation(resume=…), a function of (data, h, params) that makes the state of what is saved."
         )
