@@ -96,9 +96,10 @@ class Interpreter:
         if not is_held_by_nodes(dtype):
             failure = UnsupportedPrimitive("constant", f"has dtype {dtype}", "a captured array")
             return Held(value, failure) if known else Unavailable(failure)
-        array = np.asarray(value)
-        nodes = [self.graph.constant(item) for item in array.ravel().tolist()]
-        return np.array(nodes, dtype=np.int64).reshape(array.shape)
+        array = np.ascontiguousarray(value).reshape(np.shape(value))
+        bits = array.view(np.int64) if array.dtype == np.float64 else array  # of floats: 0 is not −0
+        numbers = dict(zip(bits.ravel().tolist(), array.ravel().tolist(), strict=True))
+        return elementwise(lambda key: self.graph.constant(numbers[key]), bits)
 
     def static(self, nodes: Nodes) -> np.ndarray | None:
         """The whole numbers that constant nodes hold, None when one is not constant."""
@@ -110,10 +111,13 @@ class Interpreter:
         """Whole numbers as their type has them. Raises `Unsupported`."""
         if isinstance(nodes, Unavailable):
             return nodes
-        found = [self.ranges.wrapped(node, variable.aval.dtype) for node in nodes.ravel().tolist()]
-        if None in found:
-            raise Unsupported("may make whole numbers that float64 does not have")
-        return np.array(found, dtype=np.int64).reshape(nodes.shape)
+
+        def wrapped(node: int) -> int:
+            if (found := self.ranges.wrapped(node, variable.aval.dtype)) is None:
+                raise Unsupported("may make whole numbers that float64 does not have")
+            return found
+
+        return elementwise(wrapped, nodes)
 
     def _known(self, equation: Any, operands: list[Any]) -> list[Any] | None:
         """The results of constants that have no rule, by JAX; None where an operand is no constant."""
@@ -200,10 +204,11 @@ def is_integer(variable: Any) -> bool:
 
 
 def elementwise(function: Callable[..., int], *operands: Nodes) -> Nodes:
-    """`function` on nodes, entry by entry, scalars spread."""
+    """`function` on nodes, entry by entry, scalars spread; asked once for entries whose operands are the same."""
     shape = operands[0].shape
     if any(a.shape != shape for a in operands):
         operands = tuple(np.broadcast_arrays(*operands))
         shape = operands[0].shape
-    flat = list(map(function, *(a.ravel().tolist() for a in operands)))
-    return np.array(flat, dtype=np.int64).reshape(shape)
+    entries = list(zip(*(a.ravel().tolist() for a in operands), strict=True))
+    found = {entry: function(*entry) for entry in dict.fromkeys(entries)}
+    return np.array([found[entry] for entry in entries], dtype=np.int64).reshape(shape)

@@ -85,7 +85,7 @@ class RelationPairs(AbstractDiscreteStructure):
 
         x, v = velocity(x0, x1)
         relation = lambda v, multipliers: jnp.asarray(self.relation.residual(x, v, multipliers, at, params))
-        of_velocity, of_multipliers = jax.jacfwd(relation, argnums=(0, 1))(v, multipliers)
+        of_velocity, of_multipliers = jacobian(relation, (0, 1))(v, multipliers)
         rest = relation(jnp.zeros_like(v), jnp.zeros_like(multipliers))
         terms = jnp.abs(of_velocity) @ jnp.abs(v) + jnp.abs(of_multipliers) @ jnp.abs(multipliers) + jnp.abs(rest)
         z = jnp.concatenate([x0, x1])
