@@ -52,6 +52,8 @@ FUNCTIONS = {
     "totals": (lambda p: jnp.einsum("ij,ij->i", p[:70].reshape(1, 70), jnp.sin(p[10:80]).reshape(1, 70)) * p[:5], P),
     "totals of rows": (lambda p: jnp.sum(jnp.outer(jnp.arange(1.0, 4.0), p) ** 2, axis=1), P),
     "few": (lambda q: jnp.sum(jnp.sin(q[:8, None] - q[None, :8]), axis=1), Q),
+    "sums beside a chain": (lambda p: jnp.append(jax.grad(energy)(p[:-1]) + p[-1], p[-1] * energy(p[:-1]) + p @ jnp.sin(p)), P),
+    "sums over edges": (lambda q: jnp.append(jnp.sin(q), jnp.sum(q[DRAWN] * q[DRAWN[::-1]]) * jnp.sum(q**3)), P),
     "rules": (lambda q: steep(q) * jax.lax.stop_gradient(q) + jax.nn.softplus(q), np.linspace(-2.0, 2.2, 50)),
 }
 
@@ -65,7 +67,9 @@ def test_loops_over_sites_do_what_jax_does(name):
     np.testing.assert_allclose(found, expected, rtol=1e-14, atol=1e-14)
 
 
-@pytest.mark.parametrize("name", ["chain", "masses", "edges", "rules", "one in two", "lattice"])
+@pytest.mark.parametrize(
+    "name", ["chain", "masses", "edges", "rules", "one in two", "lattice", "sums beside a chain", "sums over edges"]
+)
 def test_entries_of_the_jacobian_are_all_of_it(name):
     function, given = FUNCTIONS[name]
     sites = sites_of(function, jax.ShapeDtypeStruct(given.shape, float))
@@ -88,3 +92,16 @@ def test_entries_of_the_jacobian_are_all_of_it(name):
 def test_what_is_not_made_of_sites_is_told_so(function, why):
     with pytest.raises(NotBySites, match=why):
         sites_of(function, jax.ShapeDtypeStruct((N,), float))
+
+
+@pytest.mark.parametrize(
+    ("function", "why"),
+    [
+        (lambda q: q / jnp.sum(q**2), "many equations depend on a sum"),
+        (lambda p: jnp.append(p[1:], jnp.sum(jnp.sin(p - jnp.sum(p)))), "a sum of sums"),
+        (lambda p: jnp.append(p[1:], jnp.sum(p[0] * p)), "added to one entry"),
+    ],
+)
+def test_jacobians_that_are_not_made_of_sites_are_told_so(function, why):
+    with pytest.raises(NotBySites, match=why):
+        entries_of_jacobian(sites_of(function, jax.ShapeDtypeStruct((2 * N,), float)))

@@ -4,13 +4,16 @@ Which entries, of the array or of an argument, says a `Course`. They are numbere
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from dirax.program.graph import Graph
-from dirax.program.sites.courses import ALL, Course, Listed, entries_of, few, taken_apart
+from dirax.program.sites.courses import ALL, Course, Listed, NotBySites, entries_of, few, taken_apart
+
+SHORT = 64
+"""Terms of a sum that are written out; longer sums of everything are loops of their own."""
 
 
 class Place(NamedTuple):
@@ -125,6 +128,26 @@ def numbered(pieces: Sequence[Piece], size: int) -> tuple[np.ndarray, np.ndarray
         where = p.entries if listed is not None else slice(first, first + step * (p.length - 1) + 1, max(step, 1))
         of[where], number[where] = i, np.arange(p.length)
     return of, number
+
+
+def combined(e: Expressions, op: str, *arrays: Sequence[Piece]) -> list[Piece]:
+    """An operation on arrays of one size, entry by entry."""
+    return [piece._replace(node=e.graph.make(op, *nodes)) for piece, nodes in shared(e, arrays)]
+
+
+def one_at_a_time(targets: np.ndarray, size: int) -> Iterator[np.ndarray]:
+    """Which of the terms that are to be added to their `targets`, entries of an array of this size, comes next at each of them,
+    −1 for none. Raises `NotBySites` for too many at one entry."""
+    order = np.argsort(targets, kind="stable")
+    order = order[targets[order] >= 0]
+    at = targets[order]
+    rank = np.arange(len(at)) - np.searchsorted(at, at)
+    if len(at) and rank.max() >= SHORT:
+        raise NotBySites("too many terms are added to one entry")
+    for r in range(int(rank.max(initial=-1)) + 1):
+        entries = np.full(size, -1)
+        entries[at[rank == r]] = order[rank == r]
+        yield entries
 
 
 def _meeting(p: Piece, q: Piece) -> tuple[tuple[int, int, int], tuple[int, int], tuple[int, int]] | None:

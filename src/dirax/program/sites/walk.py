@@ -15,15 +15,12 @@ from dirax.program.rules.control import inner_jaxpr
 from dirax.program.rules.differentiable import RULED, is_float, tangent
 from dirax.program.rules.reductions import FOLDS, factors_of_product
 from dirax.program.sites.courses import Course, NotBySites, taken_apart
-from dirax.program.sites.pieces import Expressions, Piece, Place, gathered, shared
+from dirax.program.sites.pieces import SHORT, Expressions, Piece, Place, combined, gathered, one_at_a_time, shared
 from dirax.program.sparsity.indexing import places_of_updates, read
 from dirax.program.sparsity.movement import MOVES
 from dirax.program.sparsity.movement import pad as padded
 from dirax.program.sparsity.values import evaluated
 from dirax.program.sparsity.walk import BY_ENTRY, CALLS, IN_NUMPY, iota
-
-SHORT = 64
-"""Terms of a sum that are written out; longer sums of everything are loops of their own."""
 
 CONSTANT = 8
 """Different stretches of a known array up to which each is a constant."""
@@ -260,25 +257,14 @@ class _Walk:
             raise NotBySites("'scatter' has indices that depend on values")
         shape, given = equation.invars[0].aval.shape, equation.invars[2].aval.shape
         targets = places_of_updates(equation, indices, shape, given) - 1
-        order = np.argsort(targets, kind="stable")
-        order = order[targets[order] >= 0]
-        at = targets[order]
-        rank = np.arange(len(at)) - np.searchsorted(at, at)
-        if len(at) and rank.max() >= SHORT:
-            raise NotBySites("too many terms are added to one entry")
         total, pieces = self.pieces(value, shape), self.pieces(updates, given)
-        for r in range(int(rank.max(initial=-1)) + 1):
-            entries = np.full(math.prod(shape), -1)
-            entries[at[rank == r]] = order[rank == r]
+        for entries in one_at_a_time(targets, math.prod(shape)):
             term = self._taken(pieces, math.prod(given), entries.reshape(shape), given)
             if equation.primitive.name == "scatter":
-                kept = self._taken(total, math.prod(shape), np.where(entries < 0, np.arange(len(entries)), -1).reshape(shape))
-                total = kept
-            total = self._with("add", total, term)
+                kept = np.where(entries < 0, np.arange(len(entries)), -1)
+                total = self._taken(total, math.prod(shape), kept.reshape(shape))
+            total = combined(self.expressions, "add", total, term)
         return total
-
-    def _with(self, op: str, a: list[Piece], b: list[Piece]) -> list[Piece]:
-        return [p._replace(node=self.expressions.graph.make(op, *nodes)) for p, nodes in shared(self.expressions, [a, b])]
 
     def _product(self, equation: Any, a: Value, b: Value) -> Value:
         shapes = [v.aval.shape for v in equation.invars]
@@ -288,7 +274,7 @@ class _Walk:
         if terms > SHORT and math.prod(out) <= SHORT:
             taken = lambda k, numbers: self._taken(pieces[k], math.prod(shapes[k]), numbers, shapes[k])
             places = ((rows[b, i], columns[b, j]) for b, i, j in np.ndindex(*out))
-            return self._totals(self._with("mul", taken(0, own), taken(1, other)) for own, other in places)
+            return self._totals(combined(self.expressions, "mul", taken(0, own), taken(1, other)) for own, other in places)
         if terms > SHORT:
             raise NotBySites("'dot_general' has sums of many terms")
         total: list[Piece] | None = None
@@ -298,8 +284,8 @@ class _Walk:
                 self._taken(x, math.prod(s), n, equation.outvars[0].aval.shape)
                 for x, s, n in zip(pieces, shapes, (of_a, of_b), strict=True)
             ]
-            term = self._with("mul", *taken)
-            total = term if total is None else self._with("add", total, term)
+            term = combined(self.expressions, "mul", *taken)
+            total = term if total is None else combined(self.expressions, "add", total, term)
         size = math.prod(out)
         return total or ([Piece(Course(0, 1), size, self.expressions.graph.zero)] if size else [])
 
@@ -315,7 +301,7 @@ class _Walk:
         columns = [self._taken(pieces, math.prod(shape), column.reshape(out), shape) for column in numbers.T]
         total = columns[0]
         for column in columns[1:]:
-            total = self._with(op, total, column)
+            total = combined(self.expressions, op, total, column)
         return total
 
     def _totals(self, arrays: Iterable[list[Piece]]) -> list[Piece]:
