@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import threadpoolctl
 
+from dirax.numerics.equilibration import balancing_scales
 from dirax.numerics.inverses import LARGE, applied, applied_sizes, inverted, no_inverses, unknown
 from dirax.numerics.one_thread import one_thread
 
@@ -22,6 +23,15 @@ def test_they_solve_equations_in_any_units(k):
     right = rows * (a @ x[..., None])[..., 0]
     found = applied(inverted(rows[:, None] * a * columns), right) * columns
     np.testing.assert_allclose(found, x, rtol=1e-8, atol=1e-8)
+
+
+@pytest.mark.parametrize("alone", [False, True])
+def test_a_large_one_is_in_the_units_of_a_dense_one(alone):
+    a = 10.0 ** RNG.integers(-6, 6, (3, LARGE, LARGE)) * matrices(3, LARGE)
+    rows, columns = balancing_scales(np.abs(a) if alone else np.max(np.abs(a), axis=0)[None])
+    for one, r, c in zip(inverted(a, alone), *(np.broadcast_to(s, (3, *s.shape[1:])) for s in (rows, columns)), strict=True):
+        np.testing.assert_array_equal(one.rows, r[:, 0])
+        np.testing.assert_array_equal(one.columns, c[0])
 
 
 @pytest.mark.parametrize("k", [3, LARGE + 7])

@@ -92,6 +92,16 @@ def test_derivatives_in_numbers_are_those_of_jax(name, few, monkeypatch):
     assert found[0].in_numpy([points])[0] == pytest.approx(expected, rel=1e-14, abs=1e-14)
 
 
+def test_what_a_result_does_not_depend_on_is_known_to_be_zero_of_derivatives_in_numbers(monkeypatch):
+    monkeypatch.setattr(by_numpy, "LARGE_DERIVATIVE", 0)
+    f = lambda q: jnp.concatenate([q[:9] * q[1:10], jnp.sin(q[:1])])
+    made, _ = program_of(jacobian(f), [jax.ShapeDtypeStruct((10,), np.float64)], "zeros of derivatives")
+    unknown = np.isnan(made.constants(made.results[0]))
+    expected = np.eye(10) + np.eye(10, k=1)
+    expected[9] = np.eye(10)[0]
+    np.testing.assert_array_equal(unknown, expected != 0)
+
+
 def test_an_infinite_derivative_of_a_branch_that_is_not_taken_counts_for_nothing(monkeypatch):
     monkeypatch.setattr(by_numpy, "LARGE_DERIVATIVE", 0)
     f = lambda q: jnp.where(q[0] > 0.0, jnp.sqrt(q[0]), q[1]) + q[2]

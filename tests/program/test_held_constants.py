@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import dirax as dx
-from dirax.program.rules import reductions
+from dirax.program.rules import elementwise, reductions
 from dirax.program.scalar_program import ScalarProgram
 
 WEIGHTS = jnp.asarray(np.linspace(0.2, 0.8, 3), jnp.float32)
@@ -58,6 +58,26 @@ def test_products_of_constants_have_the_bits_of_their_sums(monkeypatch):
         monkeypatch.setattr(reductions, "LARGE", large)
         found.append(ScalarProgram.of(closed).in_numpy([np.linspace(0.1, 1.0, 12)[None]])[0])
     assert found[0].tobytes() == found[1].tobytes() and np.all(np.isfinite(found[0]))
+
+
+def test_operations_on_arrays_of_constants_have_the_bits_of_those_on_each(monkeypatch):
+    held = np.array([0.1, -0.0, np.inf, np.nan, 3.0, -2.5])
+
+    @np.errstate(invalid="ignore")
+    def function(x, xp=jnp):
+        pairs = xp.asarray(held)[:, None], xp.asarray(held)[None] + 1.0
+        found = [op(*pairs) for op in (xp.add, xp.subtract, xp.multiply, xp.less, xp.equal, xp.not_equal, xp.less_equal)]
+        return xp.stack([xp.asarray(a, float) for a in (*found, -pairs[1] * pairs[0], xp.abs(pairs[0] * pairs[1]))]), x
+
+    closed, made = jax.make_jaxpr(function)(1.0), []
+    for large in (1, 10**9):
+        monkeypatch.setattr(elementwise, "LARGE", large)
+        made.append(ScalarProgram.of(closed))
+    one, other = made
+    assert one.graph.op == other.graph.op and one.graph.args == other.graph.args
+    numbers = [np.nan_to_num(program.constants(program.results[0]), nan=7.0, posinf=np.inf, neginf=-np.inf) for program in made]
+    assert numbers[0].tobytes() == numbers[1].tobytes()
+    np.testing.assert_array_equal(one.constants(one.results[0]), function(1.0, np)[0])
 
 
 @pytest.mark.parametrize(

@@ -50,6 +50,16 @@ CASES = {
 }
 
 
+def test_roots_of_many_equations_take_no_dense_matrix(monkeypatch):
+    """Along a chain, of equations that have one solution; as plain NumPy has them."""
+    monkeypatch.setattr(by_numpy, "_inverted", lambda *given: pytest.fail("a matrix of all of them is inverted"))
+    left = lambda u, x: u + u**3 - 0.2 * (jnp.roll(u, 1) + jnp.roll(u, -1)) - x
+    x = np.random.default_rng(5).normal(size=(3, 150))
+    u = in_numpy(lambda x: nearest_root(lambda u: left(u, x), jnp.zeros(150)), [x], "roots of many equations")
+    beside = np.roll(u, 1, axis=1) + np.roll(u, -1, axis=1)
+    np.testing.assert_allclose(u + u**3 - 0.2 * beside, x, rtol=0, atol=2e-15)
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_entries_of_a_batch_are_what_jax_computes(name, monkeypatch):
     monkeypatch.setattr(module, "LANES", 4)

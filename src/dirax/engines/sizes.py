@@ -36,13 +36,13 @@ from dirax.engines.first_sizes import FAR, first_sizes
 from dirax.engines.step_program import step_program
 from dirax.engines.steps_in_numbers import StepsInNumbers
 from dirax.numerics.equilibration import power_of_two
+from dirax.numerics.sparse import FEWEST_SPARSE
 from dirax.numerics.tolerances import TINY
 from dirax.program.compiled import compiled
 from dirax.program.graph import GraphTooLarge
 from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.program.linear_solves import solve
 from dirax.program.on_host import called_on_host
-from dirax.program.roots import FEWEST_SPARSE
 
 Sizes = tuple[Any, ...]
 """Of the unknowns of each stage, (k,) or (B, k)."""

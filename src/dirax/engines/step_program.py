@@ -218,12 +218,23 @@ class StepProgram:
         """How many operations on arrays the step is for XLA."""
         return sum(e.array_operations for e in self.equations)
 
-    @cached_property
+    @property
     def jacobians(self) -> list[list[dict[int, int]]]:
         """The rows {column: node} of the Jacobian of every equation's residual. Raises `GraphTooLarge`."""
+        if isinstance(self._jacobians, GraphTooLarge):
+            raise GraphTooLarge(str(self._jacobians))
+        return self._jacobians
+
+    @cached_property
+    def _jacobians(self) -> list[list[dict[int, int]]] | GraphTooLarge:
+        """The same, or that they are too large, which takes long to find."""
         every = self.graph.copy(DERIVED * self.graph.limit)
-        found = [jacobian(every, e.residual, e.unknowns) for e in self.equations]
-        entries = iter(without_equals(self.graph, every, [node for rows in found for row in rows for node in row.values()]))
+        try:
+            found = [jacobian(every, e.residual, e.unknowns) for e in self.equations]
+            wanted = [node for rows in found for row in rows for node in row.values()]
+            entries = iter(without_equals(self.graph, every, wanted))
+        except GraphTooLarge as error:
+            return error.with_traceback(None)
         kept = [[{j: next(entries) for j in row} for row in rows] for rows in found]
         return [[{j: node for j, node in row.items() if node != self.graph.zero} for row in rows] for rows in kept]
 

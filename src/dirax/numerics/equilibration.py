@@ -46,6 +46,18 @@ def balancing_scales(sizes: Any, xp: ModuleType = np) -> tuple[Any, Any]:
     return rows, columns
 
 
+def balancing_scales_of_entries(sizes: np.ndarray, row: np.ndarray, column: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
+    """The same (…, k) of square matrices of which the sizes (…, entries) at these rows and columns are not zero."""
+    rows, columns = np.ones((*sizes.shape[:-1], k)), np.ones((*sizes.shape[:-1], k))
+    for _ in range(ROUNDS):
+        left = sizes / rows[..., row] / columns[..., column]
+        for scales, places in ((rows, row), (columns, column)):
+            order = np.argsort(places, kind="stable")
+            there, starts = np.unique(places[order], return_index=True)
+            scales[..., there] *= np.sqrt(_nonzero(np, np.maximum.reduceat(left[..., order], starts, axis=-1)))
+    return rows, columns
+
+
 def geometric_scales(sizes: Any, xp: ModuleType = np) -> tuple[Any, Any]:
     """Powers of two (…, k, 1) and (…, 1, l) by which rows and columns of a matrix with entries of these `sizes` are to be
     divided so that the geometric mean of those that are not zero is about 1 in each (Curtis and Reid 1972).

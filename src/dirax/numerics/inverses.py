@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from dirax.numerics.equilibration import balancing_scales, geometric_scales
+from dirax.numerics.equilibration import balancing_scales, balancing_scales_of_entries, geometric_scales
 
 LARGE = 64
 """Rows from which on a matrix is factored and not inverted."""
@@ -34,20 +34,34 @@ def unknown(inverses: Inverses) -> np.ndarray:
 def inverted(matrices: np.ndarray, alone: bool = False) -> Inverses:
     """Those of matrices (matrices, k, k) whose rows and columns have units in common; or each `alone`, in units of its own, so
     that its bits do not depend on the others."""
+    if matrices.shape[-1] >= LARGE:
+        return _factored(matrices, alone)
     with np.errstate(all="ignore"):
-        finite, own = np.isfinite(matrices), np.abs(matrices)
-        sizes = np.where(finite, own, 0.0) if alone else np.max(own, axis=0, where=finite, initial=0.0)[None]
-        if matrices.shape[-1] >= LARGE:
-            rows, columns = balancing_scales(sizes)
-            scaled, found = matrices / rows / columns, no_inverses(*matrices.shape[:2])
-            rows, columns = (np.broadcast_to(a, (len(matrices), *a.shape[1:])) for a in (rows, columns))
-            found[:] = [_Factored(matrix, r[:, 0], c[0]) for matrix, r, c in zip(scaled, rows, columns, strict=True)]
-            return found
-        found, grown = _scaled_inverses(matrices, *geometric_scales(sizes))
+        own = np.abs(matrices)
+        found, grown = _scaled_inverses(matrices, *geometric_scales(_sizes(matrices, alone)))
         if len(some := np.flatnonzero(grown > DOUBTFUL)):
             others, less = _scaled_inverses(matrices[some], *balancing_scales(own[some]))
             better = less < grown[some]
             found[some[better]] = others[better]
+    return found
+
+
+def _sizes(numbers: np.ndarray, alone: bool) -> np.ndarray:
+    """Those of the numbers (matrices, …) that are finite, of each matrix or (1, …) of all together."""
+    finite, own = np.isfinite(numbers), np.abs(numbers)
+    return np.where(finite, own, 0.0) if alone else np.max(own, axis=0, where=finite, initial=0.0)[None]
+
+
+def _factored(matrices: np.ndarray, alone: bool) -> Inverses:
+    """Those of large matrices, of which the entries alone are looked at that are not zero in all of them."""
+    count, k, _ = matrices.shape
+    column, row = np.nonzero(np.any(matrices != 0.0, axis=0).T)
+    numbers, found = matrices[:, row, column], no_inverses(count, k)
+    with np.errstate(all="ignore"):
+        rows, columns = balancing_scales_of_entries(_sizes(numbers, alone), row, column, k)
+        scaled = numbers / rows[:, row] / columns[:, column]
+    rows, columns = (np.broadcast_to(a, (count, k)) for a in (rows, columns))
+    found[:] = [_Factored(a, row, column, r, c) for a, r, c in zip(scaled, rows, columns, strict=True)]
     return found
 
 
@@ -92,18 +106,19 @@ def applied_sizes(inverses: Inverses, sizes: np.ndarray) -> np.ndarray:
 
 
 class _Factored:
-    """v ↦ A⁻¹v, (k, …), of a matrix that is given divided by the scales of its rows and columns; NaN for a singular one."""
+    """v ↦ A⁻¹v, (k, …), of a matrix whose entries are given, column by column, divided by the scales of its rows and columns; NaN
+    for a singular one."""
 
-    def __init__(self, matrix: np.ndarray, rows: np.ndarray, columns: np.ndarray):
+    def __init__(self, entries: np.ndarray, row: np.ndarray, column: np.ndarray, rows: np.ndarray, columns: np.ndarray):
         from scipy.sparse import csc_matrix  # imported when they are used
         from scipy.sparse.linalg import splu
 
         self.rows, self.columns, self.factors = rows, columns, None
-        if np.all(np.isfinite(matrix)):
-            column, row = np.nonzero(matrix.T)
-            starts = np.searchsorted(column, np.arange(len(matrix) + 1))
+        if np.all(np.isfinite(entries)):
+            there, size = entries != 0.0, len(rows)
+            starts = np.searchsorted(column[there], np.arange(size + 1))
             with contextlib.suppress(RuntimeError):  # it is singular
-                self.factors: Any = splu(csc_matrix((matrix[row, column], row, starts), matrix.shape))
+                self.factors: Any = splu(csc_matrix((entries[there], row[there], starts), (size, size)))
 
     def __call__(self, v: np.ndarray) -> np.ndarray:
         if self.factors is None or not np.all(np.isfinite(v)):

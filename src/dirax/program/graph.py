@@ -1,7 +1,9 @@
 """Scalar expressions, each built once: constants folded, zeros and ones simplified away, equal expressions shared."""
 
+import functools
 import itertools
 import math
+import operator
 import struct
 from collections.abc import Callable, Container, Iterable, Sequence
 from dataclasses import dataclass
@@ -337,6 +339,16 @@ class Graph:
                 seen.add(node)
                 stack.extend(self.args[node])
         return sorted(seen)
+
+    def dependence(self, outputs: Sequence[int], inputs: Sequence[int]) -> np.ndarray:
+        """Which of the outputs need which of the inputs, (outputs, inputs)."""
+        needs = {node: 1 << j for j, node in enumerate(inputs)}
+        for node in self.reachable(outputs, set(needs)):
+            needs[node] = functools.reduce(operator.or_, [needs[a] for a in self.args[node]], 0)
+        size = -(-len(inputs) // 8)
+        table = b"".join(needs[node].to_bytes(size, "little") for node in outputs)
+        bits = np.unpackbits(np.frombuffer(table, np.uint8), bitorder="little").reshape(len(outputs), 8 * size)
+        return bits[:, : len(inputs)].astype(bool)
 
     def replaced(self, outputs: Sequence[int], others: dict[int, int]) -> list[int]:
         """The outputs with other nodes in place of some."""

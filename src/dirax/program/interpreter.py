@@ -15,6 +15,9 @@ from dirax.program.whole_numbers import EXACT, Ranges
 Nodes = np.ndarray
 """An integer array of node numbers, in the shape of the array that it stands for."""
 
+MANY = 256
+"""Entries of an array from which on it pays to look for equal ones."""
+
 LOOP_LIMIT = 4096
 """Most iterations of one loop that are written out."""
 
@@ -96,16 +99,29 @@ class Interpreter:
         if not is_held_by_nodes(dtype):
             failure = UnsupportedPrimitive("constant", f"has dtype {dtype}", "a captured array")
             return Held(value, failure) if known else Unavailable(failure)
-        array = np.ascontiguousarray(value).reshape(np.shape(value))
-        bits = array.view(np.int64) if array.dtype == np.float64 else array  # of floats: 0 is not −0
-        numbers = dict(zip(bits.ravel().tolist(), array.ravel().tolist(), strict=True))
-        return elementwise(lambda key: self.graph.constant(numbers[key]), bits)
+        array = np.asarray(value)
+        numbers = array.ravel().tolist()
+        if array.dtype != np.float64 or len(numbers) < MANY:
+            return np.array(list(map(self.graph.constant, numbers)), dtype=np.int64).reshape(array.shape)
+        bits = array.ravel().view(np.int64)  # in which 0 is not −0
+        known = dict(zip(bits.tolist(), numbers, strict=True))
+        return elementwise(lambda one: self.graph.constant(known[one]), bits.reshape(array.shape))
 
     def static(self, nodes: Nodes) -> np.ndarray | None:
         """The whole numbers that constant nodes hold, None when one is not constant."""
         graph = self.graph
         flat = [graph.value[n] if graph.is_constant(n) else None for n in nodes.ravel().tolist()]
         return None if None in flat else np.array(flat, dtype=np.int64).reshape(nodes.shape)
+
+    def numbers(self, nodes: Nodes) -> np.ndarray | None:
+        """The numbers or truth values that constant nodes hold, None when one is not constant."""
+        graph = self.graph
+        if not nodes.size or not graph.is_constant(int(nodes.flat[0])):
+            return None
+        own, which = np.unique(nodes, return_inverse=True)
+        if not all(map(graph.is_constant, own.tolist())):
+            return None
+        return np.array([graph.value[node] for node in own.tolist()])[which.reshape(nodes.shape)]
 
     def whole(self, nodes: Any, variable: Any) -> Any:
         """Whole numbers as their type has them. Raises `Unsupported`."""
@@ -204,11 +220,14 @@ def is_integer(variable: Any) -> bool:
 
 
 def elementwise(function: Callable[..., int], *operands: Nodes) -> Nodes:
-    """`function` on nodes, entry by entry, scalars spread; asked once for entries whose operands are the same."""
+    """`function` on nodes, entry by entry, scalars spread; of many entries asked once for those whose operands are the same."""
     shape = operands[0].shape
     if any(a.shape != shape for a in operands):
         operands = tuple(np.broadcast_arrays(*operands))
         shape = operands[0].shape
-    entries = list(zip(*(a.ravel().tolist() for a in operands), strict=True))
+    each = [a.ravel().tolist() for a in operands]
+    if len(each[0]) < MANY:
+        return np.array(list(map(function, *each)), dtype=np.int64).reshape(shape)
+    entries = list(zip(*each, strict=True))
     found = {entry: function(*entry) for entry in dict.fromkeys(entries)}
     return np.array([found[entry] for entry in entries], dtype=np.int64).reshape(shape)

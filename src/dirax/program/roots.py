@@ -12,14 +12,12 @@ from jax.interpreters import ad
 from jaxtyping import Array, Float
 
 from dirax.numerics.newton import damped_step, sizes_of_unknowns
+from dirax.numerics.sparse import FEWEST_SPARSE
 from dirax.numerics.tolerances import TINY
 from dirax.program.given_tangents import implicit, implicit_tangent
 from dirax.program.linear_solves import equilibrated_inverse, scaled_pseudo_inverse
 from dirax.program.primitives import binds, plain_primitive
 from dirax.program.tracing import closed_over, jacobian
-
-FEWEST_SPARSE = 128
-"""Unknowns from which on equations around a run are solved by sparse elimination, where they are sparse and regular."""
 
 
 def nearest_root(residual: Callable, guess: Float[Array, " k"], max_steps: int = 100) -> Float[Array, " k"]:

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from dirax.numerics.sparse import FEWEST_SPARSE
 from dirax.numerics.tolerances import EPSILON
-from dirax.program.roots import FEWEST_SPARSE
 from dirax.program.tracing import jacobian, once
 from dirax.schemes.abstract_step import AbstractStep
 from dirax.schemes.layout import Layout

@@ -6,9 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dirax.numerics.sparse import FEWEST_SPARSE
 from dirax.numerics.tolerances import STRUCTURE_DEFECT
 from dirax.program.linear_solves import solve
-from dirax.program.roots import FEWEST_SPARSE, nearest_root
+from dirax.program.roots import nearest_root
 from dirax.program.tracing import jacobian
 from dirax.program.user_functions import evaluated
 from dirax.schemes.energy_collocation_step import EnergyCollocationStep

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 import numpy as np
 
+from dirax.numerics.sparse import FEWEST_SPARSE
 from dirax.program.legendre import constrained_velocity
 from dirax.program.linear_solves import solve
-from dirax.program.roots import FEWEST_SPARSE
 from dirax.program.tracing import along, gradient, jacobian, once
 from dirax.schemes.energy_collocation_step import EnergyCollocationStep, given_back
 from dirax.schemes.layout import Layout

@@ -12,8 +12,9 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from dirax.numerics.arrays import Data, Numbers
+from dirax.numerics.sparse import FEWEST_SPARSE
 from dirax.numerics.tolerances import SOLVED_ROUNDOFF
-from dirax.program.roots import FEWEST_SPARSE, nearest_root
+from dirax.program.roots import nearest_root
 from dirax.program.sparse_matrix import SparseMatrix
 from dirax.program.user_functions import UserFunction
 from dirax.systems.circuit_elements import (

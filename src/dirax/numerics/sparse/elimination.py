@@ -5,6 +5,7 @@ Each way has `tables` and `solve_tables`, what it knows of the pattern; `factors
 `stats`, the multiplications that a factorization takes, `operations`, and the `seconds` that it took so far.
 """
 
+from collections.abc import Callable
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -57,6 +58,21 @@ def elimination(pattern: Any) -> Elimination:
         return band
     other = FixedElimination(pattern, matched) if _has_pivots(pattern) else ExchangedElimination(pattern, matched, matched)
     return band if width <= WIDEST_BAND and band.operations <= IN_BAND * other.operations else other
+
+
+def solver_of(size: int, rows: np.ndarray, columns: np.ndarray) -> Callable[[np.ndarray], Callable[[np.ndarray], np.ndarray]]:
+    """(values) ↦ (right-hand side ↦ solution) of matrices (size, size) with their values at these rows and columns, in NumPy.
+    Raises `StructurallySingular`."""
+    pattern = sp.csr_matrix((np.arange(1, len(rows) + 1), (rows, columns)), (size, size))
+    pattern.sort_indices()
+    made = elimination(sp.csr_matrix((np.ones(pattern.nnz, bool), pattern.indices, pattern.indptr), pattern.shape))
+    tables, solve_tables, number = made.tables(pattern), made.solve_tables, np.array([size], np.int64)
+
+    def factored(values: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+        factors = made.factors(np, tables, np.ascontiguousarray(values, float), number)
+        return lambda right: made.solution(np, solve_tables, factors, np.ascontiguousarray(right, float), number, False)
+
+    return factored
 
 
 def _bordered(pattern: Any, rows: np.ndarray) -> BorderedElimination | None:

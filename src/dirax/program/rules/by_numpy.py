@@ -11,14 +11,15 @@ from jax.extend.core import ClosedJaxpr
 
 from dirax.numerics.inverses import solved
 from dirax.numerics.newton import damped_step, sizes_of_unknowns
-from dirax.numerics.tolerances import EQUATION_RANK
-from dirax.program.evaluation.in_numpy import Slopes, Values
+from dirax.numerics.sparse import FEWEST_SPARSE
+from dirax.numerics.tolerances import EQUATION_RANK, TINY
+from dirax.program.evaluation.in_numpy import LANES, Slopes, Values, in_parts
 from dirax.program.graph import GraphTooLarge
 from dirax.program.interpreter import RULES, Interpreter, Nodes, Unavailable, Unsupported, UnsupportedPrimitive
 from dirax.program.linear_solves import equilibrated_inverse, pseudo_inverses
 from dirax.program.memo import Memo, Same
 from dirax.program.rules.linear_algebra import linear_equations, split_as
-from dirax.program.rules.reductions import factors_of_product, sum_of_products
+from dirax.program.rules.reductions import factors_of_product, sum_of_products, terms_of_product, zeros_of
 from dirax.program.scalar_program import ScalarProgram, numpy_rule
 from dirax.program.tracing import jacobian, of_one_result
 
@@ -29,16 +30,24 @@ values at a few entries."""
 LARGE_FOR_FEW = 2000
 """The same of programs that are evaluated once, at a handful of entries."""
 
+TOGETHER = 2**18
+"""Numbers of the matrices that are inverted side by side, which a processor has at hand."""
+
 LARGE_PRODUCT = 256
 """Multiplications of a product of arrays from which on it is no graph of them."""
+
+MOSTLY = 16
+"""A product or a matrix is of mostly zeros where no more than one in so many numbers is another one."""
 
 
 @numpy_rule("dot_general")
 def dot_general(made: ScalarProgram, interpreter: Interpreter, equation: Any, a: Nodes, b: Nodes) -> list[Nodes]:
-    """Large products stay products of arrays; summed in one order, so that an entry's bits do not depend on the others."""
+    """Large products stay products of arrays, but for those of mostly zeros; summed in one order, so that an entry's bits do not
+    depend on the others."""
     shape, (rows, columns) = equation.outvars[0].aval.shape, factors_of_product(equation, a, b)
-    length = rows.shape[-1]
-    if math.prod(shape) * length < LARGE_PRODUCT or equation.outvars[0].aval.dtype != np.float64:
+    every = math.prod(shape) * rows.shape[-1]
+    there = lambda: np.sum(terms_of_product(rows, columns, zeros_of(made.graph, rows, columns)))
+    if every < LARGE_PRODUCT or equation.outvars[0].aval.dtype != np.float64 or MOSTLY * there() <= every:
         return list(RULES["dot_general"](interpreter, equation, a, b))
     left, right = np.moveaxis(rows, -1, 0)[..., None], np.moveaxis(columns, -1, 0)[:, :, None]
 
@@ -57,17 +66,20 @@ def derivative_in_numbers(made: ScalarProgram, interpreter: Interpreter, equatio
     if inner is None or len(inner.graph) * sum(operands[k].size for k in wanted) < large:
         return list(RULES["dirax_derivative"](interpreter, equation, *operands))
     (result,), inputs = inner.results, [node for k in wanted for node in inner.inputs[k].ravel().tolist()]
-    ends, outputs, plans = np.cumsum([operands[k].size for k in wanted])[:-1], result.ravel().tolist(), []
+    outputs, plans = result.ravel().tolist(), []
+    there = inner.graph.dependence(outputs, inputs)
 
     def slopes(arrays: list[np.ndarray]) -> list[np.ndarray]:
         plans[:] = plans or [Slopes(inner.graph, outputs, inputs)]
         known = Values(inner.graph, len(arrays[0]))
         for nodes, array in zip(inner.inputs, arrays, strict=True):
             known.bind(nodes, array)
-        parts = np.split(known.slopes(outputs, inputs, plans[0]), ends, axis=2)
-        return [part.reshape(len(part), *v.aval.shape) for part, v in zip(parts, equation.outvars, strict=True)]
+        return [known.slopes(outputs, inputs, plans[0])[:, there]]
 
-    return made.between(list(operands), [v.aval.shape for v in equation.outvars], slopes)
+    whole = np.full(there.shape, made.graph.zero)
+    whole[there] = made.between(list(operands), [(int(there.sum()),)], slopes)[0]
+    parts = np.split(whole, np.cumsum([operands[k].size for k in wanted])[:-1], axis=1)
+    return [part.reshape(v.aval.shape) for part, v in zip(parts, equation.outvars, strict=True)]
 
 
 _inner: Memo[ScalarProgram | None] = Memo(128)
@@ -168,7 +180,12 @@ def _inverted(matrices: np.ndarray, tolerance: float = EQUATION_RANK) -> list[np
     inverted = lambda a: list(equilibrated_inverse(np, a, tolerance))
     if len(matrices) > 1 and np.all(matrices == matrices[:1]):
         return [np.repeat(a, len(matrices), axis=0) for a in _of_finite(inverted, matrices[:1])]
-    return _of_finite(inverted, matrices)
+    return in_parts(lambda some: _of_finite(inverted, *some), [matrices], _together(matrices[0].size))
+
+
+def _together(numbers: int) -> int:
+    """How many matrices of so many numbers are taken at a time."""
+    return max(1, TOGETHER // max(1, numbers))
 
 
 def _of_finite(function: Callable, matrices: np.ndarray) -> list[np.ndarray]:
@@ -178,43 +195,88 @@ def _of_finite(function: Callable, matrices: np.ndarray) -> list[np.ndarray]:
     return [np.where(spread(a), a, np.nan) for a in function(np.where(spread(matrices), matrices, 0.0))]
 
 
-_equations: Memo[tuple[Callable, Callable, bool]] = Memo(128)
+At = Callable[[np.ndarray, list[np.ndarray], np.ndarray, np.ndarray], tuple[Callable, np.ndarray, np.ndarray]]
+"""(numbers of the entries, what is captured, u, r(u)) ↦ (right-hand sides ↦ solutions with the Jacobian at u, units and sizes of
+the unknowns)."""
+
+_equations: Memo[tuple[Callable, Callable[[], At], int]] = Memo(128)
 
 
-def _with_slope(residual: ClosedJaxpr) -> tuple[Callable, Callable, bool]:
-    """A residual and its derivative by the last argument, for arguments with an axis of entries; whether that is surely the same
-    whatever the last argument is."""
+def _with_slope(residual: ClosedJaxpr) -> tuple[Callable, Callable[[], At], int]:
+    """A residual for arguments with an axis of entries, how equations with its derivative by the last argument are solved, from
+    the first step of Newton's method on, and of how many entries at a time."""
     slope = jax.make_jaxpr(jacobian(of_one_result(residual), len(residual.in_avals) - 1))(*residual.in_avals)
-    value, linear = (ScalarProgram.of(jaxpr, by_numpy=True) for jaxpr in (residual, slope))
+    value = ScalarProgram.of(residual, by_numpy=True).in_numpy
+    if (sparse := _sparse(slope)) is not None:
+        return value, lambda: _by_elimination(*sparse), LANES
+    linear = ScalarProgram.of(slope, by_numpy=True)
     fixed = not linear.opaque and linear.inputs[-1].size > 0 and not linear.depends_on(linear.inputs[-1])
-    return value.in_numpy, linear.in_numpy, fixed
+    return value, lambda: _least_changes(linear.in_numpy, fixed), LANES if fixed else _together(linear.results[0].size)
+
+
+def _least_changes(linear: Callable, fixed: bool) -> At:
+    """By pseudo-inverses of the derivatives, which are `fixed` where they are surely the same whatever the unknowns are."""
+    known_of_all: list[np.ndarray] = []
+
+    def at(entries, captured, u, value):
+        if not (fixed and known_of_all):
+            known_of_all[:] = [slope := linear([*captured, u])[0], *_inverted(slope)]
+        slope, inverse, units = (a[entries] for a in known_of_all) if fixed else known_of_all
+        return lambda right: (inverse @ right[..., None])[..., 0], units, sizes_of_unknowns(slope, inverse, u, value)
+
+    return at
+
+
+def _by_elimination(values: Callable, factored: Callable) -> At:
+    """By sparse elimination, as `dirax.program.roots` does for many unknowns."""
+
+    def at(entries, captured, u, value):
+        solutions = [factored(own) for own in values([*captured, u])[0]]
+        inverse = lambda right: np.stack([solution(one) for solution, one in zip(solutions, right, strict=True)])
+        sizes = np.max(np.abs(u), axis=-1, keepdims=True, initial=TINY)
+        return inverse, np.ones(u.shape), np.broadcast_to(sizes, u.shape)
+
+    return at
+
+
+def _sparse(slope: ClosedJaxpr) -> tuple[Callable, Callable] | None:
+    """The entries of a large derivative that can differ from zero, and how equations with them are solved; None for a small one,
+    and where it is not sparse."""
+    if slope.out_avals[0].shape[0] < FEWEST_SPARSE or any(e.primitive.name != "dirax_derivative" for e in slope.jaxpr.eqns):
+        return None
+    if (made := _plain(slope)) is None:
+        return None
+    (matrix,) = made.results
+    rows, columns = np.nonzero(matrix != made.graph.zero)
+    if MOSTLY * len(rows) > matrix.size:
+        return None
+    from dirax.numerics.sparse.elimination import StructurallySingular, solver_of  # imported when it is used
+
+    made.results = [matrix[rows, columns]]
+    try:
+        return made.in_numpy, solver_of(len(matrix), rows, columns)
+    except StructurallySingular:
+        return None
 
 
 @numpy_rule("dirax_root")
 def root(made: ScalarProgram, interpreter: Interpreter, equation: Any, *operands: Nodes) -> list[Nodes]:
     """The method of `dirax.program.roots`, for all entries side by side."""
     closed: ClosedJaxpr = equation.params["residual"]
-    residual, linear, fixed = _equations.get(Same(closed), lambda: _with_slope(closed))
-    most = equation.params["max_steps"]
+    residual, begun, most = _equations.get(Same(closed), lambda: _with_slope(closed))
 
     def find(arrays: list[np.ndarray]) -> list[np.ndarray]:
         *captured, found = arrays
-        found, going = found.copy(), np.arange(len(found))
-        of_all, among = [], going
-        for _ in range(most):
+        found, going, at = found.copy(), np.arange(len(found)), begun()
+        for _ in range(equation.params["max_steps"]):
             if not len(going):
                 break
             known = [a[going] for a in captured]
-            if not fixed or not of_all:
-                of_all = [slope := linear([*known, found[going]])[0], *_inverted(slope)]
-                among = np.arange(len(going))
-            slope, inverse, units = (a[among] for a in of_all)
             value = residual([*known, found[going]])[0]
-            sizes = sizes_of_unknowns(slope, inverse, found[going], value)
-            changed = lambda value, inverse=inverse: (inverse @ value[..., None])[..., 0]
-            update = lambda u, known=known, changed=changed: changed(residual([*known, u])[0])
-            found[going], more = damped_step(changed(value), update, found[going], units, sizes)
-            going, among = going[more], among[more]
+            inverse, units, sizes = at(going, known, found[going], value)
+            update = lambda u, known=known, inverse=inverse: inverse(residual([*known, u])[0])
+            found[going], more = damped_step(inverse(value), update, found[going], units, sizes)
+            going = going[more]
         return [found]
 
-    return made.between(list(operands), [equation.outvars[0].aval.shape], find)
+    return made.between(list(operands), [equation.outvars[0].aval.shape], lambda arrays: in_parts(find, arrays, most))

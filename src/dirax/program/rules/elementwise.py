@@ -1,6 +1,7 @@
 """Rules of elementwise primitives."""
 
 import functools
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -9,6 +10,10 @@ from jax.lax import RoundingMethod
 
 from dirax.program.graph import Graph
 from dirax.program.interpreter import Interpreter, Unsupported, elementwise, is_integer, rule
+from dirax.program.operations import EXACT, NUMPY
+
+LARGE = 256
+"""Entries of an array from which on it pays to ask whether all of them are constant."""
 
 SAME = {  # primitive name → operation of the graph
     "add": "add",
@@ -68,6 +73,11 @@ BY_LEMMA = {
 @rule(*SAME)
 def same(interpreter: Interpreter, equation: Any, *operands):
     graph, op = interpreter.graph, SAME[equation.primitive.name]
+    if op in EXACT and math.prod(equation.outvars[0].aval.shape) >= LARGE:
+        known = [interpreter.numbers(nodes) for nodes in operands]
+        if all(numbers is not None for numbers in known):
+            with np.errstate(all="ignore"):
+                return [interpreter.constants(NUMPY[op](*known))]
     return [elementwise(functools.partial(DIRECT[op], graph) if op in DIRECT else functools.partial(graph.make, op), *operands)]
 
 

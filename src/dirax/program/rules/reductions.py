@@ -86,13 +86,23 @@ def dot_general(interpreter: Interpreter, equation: Any, a, b):
     of_floats = equation.outvars[0].aval.dtype == np.float64
     if of_floats and rows.size * columns.shape[1] >= LARGE and (known := _product_of_constants(g, rows, columns)) is not None:
         return [interpreter.constants(known.reshape(equation.outvars[0].aval.shape))]
-    zero = {g.zero, g.constant(-0.0)} if _are_finite(g, rows, columns) else set()
-    of_rows, of_columns = (~np.isin(nodes, list(zero)) for nodes in (rows, columns))
+    zero = zeros_of(g, rows, columns)
     out = np.full((len(rows), rows.shape[1], columns.shape[1]), g.zero)
-    for k, i, j in np.argwhere(of_rows.astype(float) @ np.swapaxes(of_columns, 1, 2)).tolist():
+    for k, i, j in np.argwhere(terms_of_product(rows, columns, zero)).tolist():
         pairs = zip(rows[k, i].tolist(), columns[k, j].tolist(), strict=True)
         out[k, i, j] = fold(interpreter, "add", [g.mul(x, y) for x, y in pairs if x not in zero and y not in zero])
     return [out.reshape(equation.outvars[0].aval.shape)]
+
+
+def terms_of_product(rows: np.ndarray, columns: np.ndarray, zero: set[int]) -> np.ndarray:
+    """How many terms that are not surely zero each entry of a product is the sum of, (batch, i, j)."""
+    of_rows, of_columns = (~np.isin(nodes, list(zero)) for nodes in (rows, columns))
+    return of_rows.astype(float) @ np.swapaxes(of_columns, 1, 2)
+
+
+def zeros_of(g: Graph, *factors: np.ndarray) -> set[int]:
+    """The nodes with which a product of entries of these factors is zero."""
+    return {g.zero, g.constant(-0.0)} if _are_finite(g, *factors) else set()
 
 
 def _are_finite(g: Graph, *factors: np.ndarray) -> bool:
