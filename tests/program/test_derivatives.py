@@ -33,6 +33,7 @@ SCALARS = {
     "a corner": lambda q: jnp.abs(q[2]) * jnp.maximum(q[0], q[1]),
     "a solve": lambda q: q @ jnp.linalg.solve(jnp.diag(1 + q**2) + 0.1, q),
     "no dependence": lambda q: jnp.ones(()) + 0.0 * jnp.floor(q[0]),
+    "a decomposition that is compared": lambda q: jnp.where(jnp.linalg.eigvalsh(jnp.outer(q, q))[0] < 1.0, q[0] ** 2, q[1]),
     "what is held": lambda q: jax.lax.stop_gradient(q[0]) * q[1],
 }
 VECTORS = {

@@ -32,6 +32,9 @@ PLAIN = frozenset(
 maximum), no solves, which the graph would take apart, and no functions with an edge near which the
 graph loses digits or meets ∞·0 (an arcsine, a logistic function)."""
 
+COMPARED = frozenset(("abs", "max", "min", "clamp", "reduce_max", "reduce_min", "stop_gradient", "dirax_solve"))
+"""Others that the graph has, which have no derivative where they lead to comparisons alone."""
+
 RULE = "custom_jvp_call"
 """A function with a rule of its own for its derivative, which the graph knows how to take where it is one of numbers."""
 
@@ -164,11 +167,11 @@ def all_plain(jaxpr: Any) -> bool:
     """Whether the graph has the same derivative as JAX of all that a jaxpr does; what leads to comparisons alone has none."""
     moving = {v for v in jaxpr.outvars if _has_derivative(v)}
     for equation in reversed(jaxpr.eqns):
-        if moving.isdisjoint(equation.outvars):
-            continue
-        if not (_numbers(equation) if equation.primitive.name == RULE else _plain_one(equation)):
+        moves = not moving.isdisjoint(equation.outvars)
+        if not _is_plain(equation, moves):
             return False
-        moving.update(v for v in equation.invars if _has_derivative(v))
+        if moves:
+            moving.update(v for v in equation.invars if _has_derivative(v))
     return True
 
 
@@ -178,14 +181,19 @@ def _has_derivative(value: Any) -> bool:
     return isinstance(value, Var) and bool(np.issubdtype(kind.dtype, np.floating))
 
 
-def _plain_one(equation: Any) -> bool:
-    known = equation.primitive.name in PLAIN or equation.params.get("apart", False)
-    return known and all(map(_all_plain_within, jaxprs_in_params(equation.params)))
+def _is_plain(equation: Any, moves: bool) -> bool:
+    """Whether the graph has what an equation does, and its derivative where its results move."""
+    name = equation.primitive.name
+    if name == RULE:
+        return _numbers(equation)
+    known = name in PLAIN or (name in COMPARED and not moves) or equation.params.get("apart", False)
+    return known and all(_is_plain_within(jaxpr, moves) for jaxpr in jaxprs_in_params(equation.params))
 
 
-def _all_plain_within(jaxpr: Any) -> bool:
+def _is_plain_within(jaxpr: Any, moves: bool) -> bool:
     """The same of a function that is called, which is so in many places, and is asked once."""
-    return _inner.get(Same(jaxpr), lambda: all_plain(jaxpr))
+    every = lambda: all_plain(jaxpr) if moves else all(_is_plain(equation, False) for equation in jaxpr.eqns)
+    return _inner.get((Same(jaxpr), moves), every)
 
 
 def _numbers(equation: Any) -> bool:
