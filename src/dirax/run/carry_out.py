@@ -1,7 +1,7 @@
 """A run carried out: by the plan for its kind where there is one, else discretize → start → engine; then its Solution."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -39,14 +39,11 @@ from dirax.run.validate import Case, refuse_clock_that_stands, refuse_more_than_
 from dirax.schemes.step import Shape, make_step_equation
 from dirax.solution.solution import Solution
 
-QUICK = 1e-4
-"""Seconds that a start takes at least to be kept for a run from the same numbers."""
-
 STARTS = 16
 """Starts of runs of one kind that are kept, of the last ones that were found."""
 
 LARGEST_START = 2**16
-"""Numbers of a state up to which they are."""
+"""Numbers of an array of initial data up to which they are."""
 
 
 @dataclass
@@ -57,11 +54,11 @@ class Kind:
     runs: int = 0
     plan: AnyPlan | None = None
     engine: Callable | None = None
-    starts: dict[tuple, "Begun"] = field(default_factory=dict)
+    starts: dict[Hashable, "Begun"] = field(default_factory=dict)
 
-    def again(self, case: Case, steps: int, save_every: int, asked: int) -> "Begun | None":
+    def again(self, numbers: Hashable, case: Case, steps: int, save_every: int, asked: int) -> "Begun | None":
         """The start of a run from the same numbers, of so many steps."""
-        found = self.starts.get(_numbers(case))
+        found = self.starts.get(numbers)
         if found is None:
             return None
         steps -= int(case.two_points)
@@ -69,17 +66,20 @@ class Kind:
         refuse_more_than_memory(problem)
         return found.with_numbers(case=case, problem=problem, save_every=asked)
 
-    def keep(self, case: Case, found: "Begun", seconds: float) -> None:
-        """Keep a start that took a while; those of batches are large, and a plan finds them in a small part of their steps."""
-        if seconds < QUICK or case.batch is not None or found.case is not case or np.size(found.problem.state) > LARGEST_START:
+    def keep(self, numbers: Hashable, case: Case, found: "Begun") -> None:
+        """Keep a start for runs from the same numbers."""
+        if numbers is None or found.case is not case:
             return
         for oldest in list(self.starts)[: max(0, len(self.starts) - STARTS + 1)]:
             self.starts.pop(oldest, None)
-        self.starts[_numbers(case)] = found
+        self.starts[numbers] = found
 
 
-def _numbers(case: Case) -> tuple:
-    """Equal for cases of one kind with the same numbers, bit by bit."""
+def _numbers(case: Case) -> Hashable:
+    """Equal for cases of one kind with the same numbers, bit by bit; None for what is large, and for batches, whose starts a plan
+    finds in a small part of their steps."""
+    if case.batch is not None or max([a.size for a in case.data.values()]) > LARGEST_START:
+        return None
     return *[a.tobytes() for a in case.data.values()], *bytes_of(case.params), case.h, case.t0
 
 
@@ -138,18 +138,19 @@ def carried_out(
         case = without_redundant(settings.system, case, settings.project)
         problem, outcome, row0 = carried_by_jax(_by_jax(settings, steps, every), settings, case, steps, every)
         return solution_of(settings.system, settings.scheme, case, problem, outcome, row0, True)
-    if kind is not None and kind.starts and (again := kind.again(case, steps, every, save_every)):
+    numbers = _numbers(case) if kind is not None else None
+    if kind is not None and numbers is not None and (again := kind.again(numbers, case, steps, every, save_every)):
         return _run(settings, kind, again, steps, progress, entered, began)
     if kind is not None and kind.plan is not None:
         problem = kind.plan.problem(case, steps, every)
         if problem is not None:
             refuse_more_than_memory(problem)
             found = Begun(case, problem, (), None, False, _no_plan, save_every=save_every)
-            kind.keep(case, found, time.perf_counter() - began)
+            kind.keep(numbers, case, found)
             return _run(settings, kind, found, steps, progress, entered, began)
     found = _begun(settings, case, steps, every, save_every)
     if kind is not None and not found.traced:
-        kind.keep(case, found, time.perf_counter() - began)
+        kind.keep(numbers, case, found)
         if kind.plan is not None and found.plain:
             kind.plan.learn(case.params)
         kind.runs += 1

@@ -37,7 +37,7 @@ class Plan:
     def __init__(self, settings: Settings, case: Case, shape: Shape, initial: Initial, start: Start, problem: Problem):
         self.settings, self.template = settings, problem
         equation = problem.equation
-        self.checks = checks_of(equation)
+        self.checks, self.names = checks_of(equation), sorted(case.data)
         complete = program_of_completion(settings.system, case, settings.project)
         begun = program_of_beginning(equation, case, initial.data)
         self.complete: Any = complete and complete[0].in_floats
@@ -68,7 +68,7 @@ class Plan:
         if not self.premise.holds(case, self.regular):
             return None
         leaves = jax.tree.leaves(case.params)
-        data = [x for name in sorted(case.data) for x in case.data[name].tolist()]
+        data = [x for name in self.names for x in case.data[name].tolist()]
         last = [*(x for leaf in leaves for x in leaf.ravel().tolist()), case.h, case.t0]
         try:
             initial = self.complete((*data, *last))
