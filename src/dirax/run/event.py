@@ -149,12 +149,17 @@ def evaluated(event: Event, number: int, known: dict[str, Any], params: Any) -> 
         found = event({**known, "params": params})
     except Exception as error:
         raise TypeError(f"events[{number}] could not be traced by JAX: {error_text(error)}") from error
+    refuse_no_number(f"the function of events[{number}]", found)
+    return found
+
+
+def refuse_no_number(what: str, found: Any) -> None:
+    """Raise `TypeError` and `ValueError` for what a user's function returned, if it is no real number."""
     if not hasattr(found, "shape") or found.shape != ():
         came = f"shape {found.shape}: index or sum its result" if hasattr(found, "shape") else type(found).__name__
-        raise ValueError(f"the function of events[{number}] must return one number, but it returned {came}.")
+        raise ValueError(f"{what} must return one number, but it returned {came}.")
     if not jnp.issubdtype(found.dtype, jnp.floating):
-        raise TypeError(f"the function of events[{number}] must return a real number (float64), but its dtype is {found.dtype}.")
-    return found
+        raise TypeError(f"{what} must return a real number (float64), but its dtype is {found.dtype}.")
 
 
 def captures_traced(what: str, function: Callable, *arguments: Any) -> tuple[Any, bool]:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.engines.contract import Outcome, Problem, finished
-from dirax.run.event import OutsideIndex, captures_traced
+from dirax.run.event import OutsideIndex, captures_traced, refuse_no_number
 from dirax.run.flight import Flight
 from dirax.run.flights import Flights, behind
 from dirax.run.impact import Impact
@@ -115,11 +115,7 @@ def _seen(what: str, function: Callable, *arguments: Any) -> bool:
         raise
     except Exception as error:
         raise TypeError(f"{what} could not be traced by JAX: {error_text(error)}") from error
-    if not hasattr(found, "shape") or found.shape != ():
-        came = f"shape {found.shape}: index or sum its result" if hasattr(found, "shape") else type(found).__name__
-        raise ValueError(f"{what} must return one number, but it returned {came}.")
-    if not jnp.issubdtype(found.dtype, jnp.floating):
-        raise TypeError(f"{what} must return a real number (float64), but its dtype is {found.dtype}.")
+    refuse_no_number(what, found)
     return traced
 
 
