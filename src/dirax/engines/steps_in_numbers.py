@@ -315,8 +315,7 @@ class StepsInNumbers:
         fixed, u, begun = None, safe.copy(), safe.copy()
         inverse, size = near.inverses[stage], near.sizes[stage]
         last, left, renewed = np.full(count, np.inf), np.arange(count), unknown(inverse)
-        of_some = lambda some: (u[some], states[some], tuple(a[some] for a in at), inverse[some])
-        is_solved = lambda some: self._is_solved(stage, *of_some(some))
+        is_solved = lambda some: self._is_solved(stage, u[some], states[some], tuple(a[some] for a in at), inverse[some])
         own = renewed.copy()  # the Jacobian is of these equations, or was seen to contract
         for _ in range(UPDATES):
             some = known if fixed is None else fixed.at(left) if len(left) < count else fixed.without(set())

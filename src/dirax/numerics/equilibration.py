@@ -49,11 +49,13 @@ def balancing_scales(sizes: Any, xp: ModuleType = np) -> tuple[Any, Any]:
 def balancing_scales_of_entries(sizes: np.ndarray, row: np.ndarray, column: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
     """The same (…, k) of square matrices of which the sizes (…, entries) at these rows and columns are not zero."""
     rows, columns = np.ones((*sizes.shape[:-1], k)), np.ones((*sizes.shape[:-1], k))
+    lines = []
+    for scales, places in ((rows, row), (columns, column)):
+        order = np.argsort(places, kind="stable")
+        lines.append((scales, order, *np.unique(places[order], return_index=True)))
     for _ in range(ROUNDS):
         left = sizes / rows[..., row] / columns[..., column]
-        for scales, places in ((rows, row), (columns, column)):
-            order = np.argsort(places, kind="stable")
-            there, starts = np.unique(places[order], return_index=True)
+        for scales, order, there, starts in lines:
             scales[..., there] *= np.sqrt(_nonzero(np, np.maximum.reduceat(left[..., order], starts, axis=-1)))
     return rows, columns
 

@@ -14,7 +14,7 @@ from dirax.numerics.loops.kernel import Kernel
 from dirax.numerics.sparse import kernels
 from dirax.numerics.sparse.border import full_lines
 from dirax.numerics.sparse.colours import column_colours
-from dirax.numerics.sparse.elimination import elimination
+from dirax.numerics.sparse.elimination import elimination, numbered, places
 from dirax.numerics.sparse.orders import whole
 from dirax.program.sparsity import pattern_of
 
@@ -60,7 +60,7 @@ class SparseEquations(eqx.Module):
     def of_entries(cls, size: int, rows: np.ndarray, columns: np.ndarray) -> "SparseEquations":
         """Those of a Jacobian (size, size) whose values are the entries at these rows and columns, each once. Raises
         `StructurallySingular`."""
-        return cls._of_pattern(sp.csr_matrix((np.arange(1, len(rows) + 1), (rows, columns)), (size, size)), len(rows))
+        return cls._of_pattern(numbered(size, rows, columns), len(rows))
 
     @property
     def products(self) -> int:
@@ -75,11 +75,7 @@ class SparseEquations(eqx.Module):
         full_rows, _ = full_lines(pattern)
         colours = column_colours(pattern[np.setdiff1d(np.arange(size), full_rows)] if len(full_rows) else pattern)
         count = int(np.max(colours, initial=-1)) + 1
-        full, there = (
-            tuple(full_rows.tolist()),
-            sp.csr_matrix((np.ones(pattern.nnz, bool), pattern.indices, pattern.indptr), pattern.shape),
-        )
-        made = elimination(there)
+        full, made = tuple(full_rows.tolist()), elimination(places(pattern))
         total = (count + len(full)) * size if length is None else length
         if length is None:
             entries = pattern.tocoo()

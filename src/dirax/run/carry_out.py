@@ -139,7 +139,7 @@ def carried_out(
         problem, outcome, row0 = carried_by_jax(_by_jax(settings, steps, every), settings, case, steps, every)
         return solution_of(settings.system, settings.scheme, case, problem, outcome, row0, True)
     numbers = _numbers(case) if kind is not None else None
-    if kind is not None and numbers is not None and (again := kind.again(numbers, case, steps, every, save_every)):
+    if kind is not None and (again := kind.again(numbers, case, steps, every, save_every)):
         return _run(settings, kind, again, steps, progress, entered, began)
     if kind is not None and kind.plan is not None:
         problem = kind.plan.problem(case, steps, every)

@@ -24,7 +24,7 @@ def shape_of(system: Any, data: Mapping[str, Any], params: Any) -> Shape:
     """The sizes of a system with these data of one trajectory. Raises `TypeError` and `ValueError` where a
     method of one that is not dirax's own returns what it should not."""
     sizes = system.sizes(data, params)
-    if type(system).__module__.startswith("dirax."):
+    if package_of(system) == "dirax":
         return Shape(*sizes)
     name = type(system).__name__
     if not isinstance(sizes, tuple | list) or len(sizes) not in (2, 3) or not all(is_whole(size) and size >= 0 for size in sizes):

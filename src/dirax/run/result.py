@@ -54,7 +54,7 @@ def solution_of(
         field_info=p.fields,
         step=p.h,
         save_every=p.save_every,
-        stats=stats_of(p, outcome, traced, {} if traced else p.review(fields)),
+        stats=stats_of(p, outcome, traced) | ({} if traced else p.review(fields)),
         ok=ok,
         message=message,
         system=system,
@@ -102,8 +102,8 @@ def times_of(p: Problem, numbers: np.ndarray, traced: bool):
     return numbers
 
 
-def stats_of(p: Problem, outcome: Outcome, traced: bool, reviewed: dict[str, Any]) -> dict[str, Any]:
-    """What `Solution.stats` say of what an engine gave back, and what a scheme says of it."""
+def stats_of(p: Problem, outcome: Outcome, traced: bool) -> dict[str, Any]:
+    """What `Solution.stats` say of what an engine gave back."""
     one = len(outcome.iterations) == 1
     total = outcome.iterations[0] if one else outcome.iterations.sum()
     worst = outcome.max_residual[0] if one else outcome.max_residual.max()
@@ -115,5 +115,4 @@ def stats_of(p: Problem, outcome: Outcome, traced: bool, reviewed: dict[str, Any
         "compile_seconds": outcome.compile_seconds,
         "run_seconds": outcome.run_seconds,
         **outcome.notes,
-        **reviewed,
     }

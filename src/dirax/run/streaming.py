@@ -216,7 +216,7 @@ class Stream:
         return {
             "ok": json.dumps(bool(np.all(good))),
             "message": json.dumps(by_lane),
-            "stats": json.dumps(plain(stats_of(p, outcome, False, {}), nonfinite=True)),
+            "stats": json.dumps(plain(stats_of(p, outcome, False), nonfinite=True)),
             "lanes_ok": [] if p.batch is None else good.tolist(),
         }
 

@@ -60,12 +60,23 @@ def elimination(pattern: Any) -> Elimination:
     return band if width <= WIDEST_BAND and band.operations <= IN_BAND * other.operations else other
 
 
+def numbered(size: int, rows: np.ndarray, columns: np.ndarray) -> Any:
+    """The pattern of matrices (size, size) with values at these rows and columns, which it numbers from 1 in their order."""
+    pattern = sp.csr_matrix((np.arange(1, len(rows) + 1), (rows, columns)), (size, size))
+    pattern.sort_indices()
+    return pattern
+
+
+def places(pattern: Any) -> Any:
+    """Where a pattern has entries, in the same order."""
+    return sp.csr_matrix((np.ones(pattern.nnz, bool), pattern.indices, pattern.indptr), pattern.shape)
+
+
 def solver_of(size: int, rows: np.ndarray, columns: np.ndarray) -> Callable[[np.ndarray], Callable[[np.ndarray], np.ndarray]]:
     """(values) ↦ (right-hand side ↦ solution) of matrices (size, size) with their values at these rows and columns, in NumPy.
     Raises `StructurallySingular`."""
-    pattern = sp.csr_matrix((np.arange(1, len(rows) + 1), (rows, columns)), (size, size))
-    pattern.sort_indices()
-    made = elimination(sp.csr_matrix((np.ones(pattern.nnz, bool), pattern.indices, pattern.indptr), pattern.shape))
+    pattern = numbered(size, rows, columns)
+    made = elimination(places(pattern))
     tables, solve_tables, number = made.tables(pattern), made.solve_tables, np.array([size], np.int64)
 
     def factored(values: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:

@@ -134,8 +134,7 @@ class Slopes:
         return RowTape(self.graph, self.nodes, self.inputs, self.more, self.terms, self.needed, self.backward)
 
 
-def in_parts(function: Callable, leaves: list[np.ndarray], most: int = 0) -> list[np.ndarray]:
-    """`function` on as many entries of the leaves at a time as are said, or on LANES."""
-    most = most or LANES
+def in_parts(function: Callable, leaves: list[np.ndarray], most: int = LANES) -> list[np.ndarray]:
+    """`function` on so many entries of the leaves at a time at most."""
     parts = [function([leaf[low : low + most] for leaf in leaves]) for low in range(0, len(leaves[0]), most)]
     return parts[0] if len(parts) == 1 else [np.concatenate(pieces) for pieces in zip(*parts, strict=True)]

@@ -84,7 +84,8 @@ def dot_general(interpreter: Interpreter, equation: Any, a, b):
     g = interpreter.graph
     rows, columns = factors_of_product(equation, a, b)
     of_floats = equation.outvars[0].aval.dtype == np.float64
-    if of_floats and rows.size * columns.shape[1] >= LARGE and (known := _product_of_constants(g, rows, columns)) is not None:
+    large = of_floats and rows.size * columns.shape[1] >= LARGE
+    if large and (known := _product_of_constants(interpreter, rows, columns)) is not None:
         return [interpreter.constants(known.reshape(equation.outvars[0].aval.shape))]
     zero = zeros_of(g, rows, columns)
     out = np.full((len(rows), rows.shape[1], columns.shape[1]), g.zero)
@@ -111,16 +112,11 @@ def _are_finite(g: Graph, *factors: np.ndarray) -> bool:
     return all(c is None or math.isfinite(c) for c in constants)
 
 
-def _product_of_constants(g: Graph, rows: np.ndarray, columns: np.ndarray) -> np.ndarray | None:
+def _product_of_constants(interpreter: Interpreter, rows: np.ndarray, columns: np.ndarray) -> np.ndarray | None:
     """The product in numbers, with the bits of the sums that nodes would be made for; None where a factor is no constant."""
-    factors = []
-    for nodes in (rows, columns):
-        own, which = np.unique(nodes, return_inverse=True)
-        values = [g.number(node) for node in own.tolist()]
-        if None in values:
-            return None
-        factors.append(np.array(values, float)[which.reshape(nodes.shape)])
-    left, right = (np.moveaxis(a, -1, 1) for a in factors)
+    if (left := interpreter.numbers(rows)) is None or (right := interpreter.numbers(columns)) is None:
+        return None
+    left, right = (np.moveaxis(a, -1, 1) for a in (left, right))
     return sum_of_products(left[..., None], right[:, :, None])
 
 
