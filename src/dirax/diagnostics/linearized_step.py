@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.diagnostics.linearized_field import FieldAt, equations_of, filled, scaled_matrix
+from dirax.engines.lifted import lifted
 from dirax.numerics.equilibration import balanced_inverse
 from dirax.numerics.newton import AT_FLOOR, sizes_of_unknowns
 from dirax.program.memo import Memo, Same
@@ -94,6 +95,7 @@ def linearized_step(
     shape = Shape(*system.sizes(dict(case.data), case.params))
     redundant = redundant_constraints(system, initial.constraints, dict(case.data), case.params, case.t0)
     equation = make_step_equation(scheme, system, Shape(shape.n, shape.m, shape.c, redundant=redundant))
+    equation = lifted(equation, case.params, case.batch_params)
     began = begun(equation, case, initial)
     first = np.asarray(began.state)
     layout = equation.stages[0][0].state_layout

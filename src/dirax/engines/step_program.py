@@ -13,6 +13,7 @@ from jax.extend.core import ClosedJaxpr, jaxprs_in_params
 import dirax.program.rules  # noqa: F401  (registers the rules)
 from dirax.engines import policy
 from dirax.engines.parameters import Parameters, parameters
+from dirax.engines.step_jaxpr import step_jaxpr
 from dirax.program.equal_nodes import without_equals
 from dirax.program.evaluation.by_jax import by_jax
 from dirax.program.evaluation.in_floats import Floats, in_floats
@@ -72,33 +73,11 @@ def inputs(g: Graph, size: int) -> Inputs:
     return Inputs(g.input("t"), g.input("h"), [g.input(f"param{i}") for i in range(size)])
 
 
-_jaxprs: Memo[ClosedJaxpr] = Memo(KEPT)
-
-
 def trace(g: Graph, shared: Inputs, equation: Any, p: Parameters) -> TracedEquation:
     """The nodes of one equation, which is traced once, whether alone or as a part of compositions. Raises
     `UnsupportedPrimitive`."""
-    closed, s, k = _jaxprs.get((Same(equation), p.key), lambda: _jaxpr(equation, p)), equation.state_size, equation.unknowns
+    closed, s, k = step_jaxpr(equation, p), equation.state_size, equation.unknowns
     return _nodes(g, shared, closed, tuple(sorted(equation.fields)), s, k, p, equation.weak)
-
-
-def _jaxpr(equation: Any, p: Parameters) -> ClosedJaxpr:
-    """(u, state, previous, t, h, parameters) ↦ guess, residual, advance and the fields of a row in the order of their names."""
-    s, k = equation.state_size, equation.unknowns
-    scalar, vector = jax.ShapeDtypeStruct((), jnp.float64), lambda n: jax.ShapeDtypeStruct((n,), jnp.float64)
-    leaf_shapes = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in p.shapes]
-
-    def everything(u, state, previous, t, h, leaves):
-        params = p.rebuild(leaves)
-        row = equation.unpack(state, u, t, h, params)
-        return (
-            equation.guess(state, previous, h, params),
-            equation.residual(u, state, t, h, params),
-            equation.advance(u, state, t, h, params),
-            [jnp.asarray(row[name]) for name in sorted(row)],
-        )
-
-    return jax.make_jaxpr(everything)(vector(k), vector(s), vector(k), scalar, scalar, leaf_shapes)
 
 
 def _nodes(

@@ -70,7 +70,8 @@ def implicit_tangent(residual: Callable, root: Array, operands: Sequence, along:
     return -solve(jacobian_by_jax(lambda u: residual(u, *operands))(root), right)
 
 
-def _over(function: Callable, axes: Axes) -> Callable:
+def over(function: Callable, axes: Axes) -> Callable:
+    """A function of operands under the `jax.vmap`s that they went through."""
     for one in axes:
         function = jax.vmap(function, in_axes=one)
     return function
@@ -78,11 +79,11 @@ def _over(function: Callable, axes: Axes) -> Callable:
 
 def value_jaxpr(shapes: Sequence, *, value: Callable, tangent: Callable, axes: Axes) -> ClosedJaxpr:
     """What a function of arguments of these shapes is, but for its derivative."""
-    return jax.make_jaxpr(_over(value, axes))(*shapes)
+    return jax.make_jaxpr(over(value, axes))(*shapes)
 
 
 def _by_jax(*operands, value: Callable, tangent: Callable, axes: Axes) -> Array:
-    return _over(value, axes)(*operands)
+    return over(value, axes)(*operands)
 
 
 def _tangents(primals: Sequence, tangents: Sequence, *, value: Callable, tangent: Callable, axes: Axes):
@@ -95,17 +96,38 @@ def _tangents(primals: Sequence, tangents: Sequence, *, value: Callable, tangent
         return tangent(result, given[:count], [next(along) if moved else None for moved in moves])
 
     levels = tuple((0, *level, *(a for a, moved in zip(level, moves, strict=True) if moved)) for level in axes)
-    return result, _over(one, levels)(result, *primals, *(t for t, moved in zip(tangents, moves, strict=True) if moved))
+    return result, over(one, levels)(result, *primals, *(t for t, moved in zip(tangents, moves, strict=True) if moved))
 
 
-def _batched(operands: Sequence, dimensions: Sequence, *, value: Callable, tangent: Callable, axes: Axes):
-    moved = [x if d is None else jnp.moveaxis(x, d, 0) for x, d in zip(operands, dimensions, strict=True)]
-    level = tuple(None if d is None else 0 for d in dimensions)
-    return given_p.bind(*moved, value=value, tangent=tangent, axes=(*axes, level)), 0
+def lead_of(operands: Sequence, axes: Axes) -> tuple[int, ...]:
+    """The lengths of the axes that the results have for the `jax.vmap`s of the operands, which have such axes in front."""
+    lead, shapes = [], [x.shape for x in operands]
+    for level in reversed(axes):
+        lead.append(next(shape[0] for shape, axis in zip(shapes, level, strict=True) if axis is not None))
+        shapes = [shape if axis is None else shape[1:] for shape, axis in zip(shapes, level, strict=True)]
+    return tuple(lead)
+
+
+def at_place(operands: Sequence, axes: Axes, index: tuple[int, ...]) -> list:
+    """The operands for one place of the axes that `jax.vmap`s gave them."""
+    own = [[i for i, level in zip(index, reversed(axes), strict=True) if level[k] is not None] for k in range(len(operands))]
+    return [x[tuple(place)] for x, place in zip(operands, own, strict=True)]
+
+
+def stays_one(primitive: Primitive) -> Callable:
+    """The rule of `jax.vmap` for a primitive that stays one equation, and is told of the axis."""
+
+    def batched(operands: Sequence, dimensions: Sequence, *, axes: Axes, **parameters: Any):
+        moved = [x if d is None else jnp.moveaxis(x, d, 0) for x, d in zip(operands, dimensions, strict=True)]
+        level = tuple(None if d is None else 0 for d in dimensions)
+        found = primitive.bind(*moved, **parameters, axes=(*axes, level))
+        return found, [0] * len(found) if primitive.multiple_results else 0
+
+    return batched
 
 
 def _shape(*operands, value: Callable, tangent: Callable, axes: Axes) -> ShapedArray:
-    found = jax.eval_shape(_over(value, axes), *(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in operands))
+    found = jax.eval_shape(over(value, axes), *(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in operands))
     return ShapedArray(found.shape, found.dtype)
 
 
@@ -113,5 +135,5 @@ given_p = Primitive("dirax_given_tangent")
 given_p.def_impl(_by_jax)
 given_p.def_abstract_eval(_shape)
 ad.primitive_jvps[given_p] = _tangents
-batching.primitive_batchers[given_p] = _batched
+batching.primitive_batchers[given_p] = stays_one(given_p)
 mlir.register_lowering(given_p, mlir.lower_fun(_by_jax, multiple_results=False))

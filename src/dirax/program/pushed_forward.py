@@ -10,10 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
 
-from dirax.program.linear_solves import scaled_pseudo_inverse
-from dirax.program.roots import root_p
+from dirax.program.roots import least_change, root_p
 from dirax.program.same_jaxpr import shared
-from dirax.program.tracing import all_plain, directional_p, jacobian, of_one_result
+from dirax.program.tracing import all_plain, alone, directional_p, jacobian, of_one_result
 
 Moved = list[tuple[Any, Any]]
 """Values, each with its tangent, None where it stands still."""
@@ -42,14 +41,13 @@ def _of_jaxpr(closed: ClosedJaxpr, given: Moved) -> Moved:
     known.update(zip(closed.jaxpr.invars, given, strict=True))
     read = lambda atom: (atom.val, None) if isinstance(atom, Literal) else known[atom]
     for equation in closed.jaxpr.eqns:
-        if equation.primitive is root_p:
+        if equation.primitive is root_p and not equation.params["axes"]:
             results = _of_root(equation, [read(atom) for atom in equation.invars])
         elif equation.primitive.name in CALLS:
             results = _of_jaxpr(equation.params["jaxpr"], [read(atom) for atom in equation.invars])
         else:
-            variables = list(dict.fromkeys(atom for atom in equation.invars if not isinstance(atom, Literal)))
-            alone = closed.jaxpr.replace(constvars=(), invars=variables, outvars=equation.outvars, eqns=[equation])
-            results = _of_equation(ClosedJaxpr(alone, ()), [read(v) for v in variables])
+            one, variables = alone(closed.jaxpr, equation)
+            results = _of_equation(one, [read(v) for v in variables])
         known.update(zip(equation.outvars, results, strict=True))
     return [read(atom) for atom in closed.jaxpr.outvars]
 
@@ -70,16 +68,16 @@ def _along(closed: ClosedJaxpr, given: Moved) -> Moved:
     return [(value, directional_p.bind(*operands, jaxpr=shared(ClosedJaxpr(jaxpr, closed.consts)), count=len(along))[0])]
 
 
-def _of_equation(alone: ClosedJaxpr, given: Moved) -> Moved:
+def _of_equation(one: ClosedJaxpr, given: Moved) -> Moved:
     moving = [k for k, (_, along) in enumerate(given) if along is not None]
-    if not moving or (alone.eqns[0].primitive.name.startswith("dirax_") and _is_derived(alone)):
-        return _of_jaxpr(alone, given) if moving else [(x, None) for x in jaxpr_as_fun(alone)(*(x for x, _ in given))]
+    if not moving or (one.eqns[0].primitive.name.startswith("dirax_") and _is_derived(one)):
+        return _of_jaxpr(one, given) if moving else [(x, None) for x in jaxpr_as_fun(one)(*(x for x, _ in given))]
 
     def of_moving(*values: Any) -> list:
         point = [x for x, _ in given]
         for k, value in zip(moving, values, strict=True):
             point[k] = value
-        return jaxpr_as_fun(alone)(*point)
+        return jaxpr_as_fun(one)(*point)
 
     values, tangents = jax.jvp(of_moving, tuple(given[k][0] for k in moving), tuple(given[k][1] for k in moving))
     return [(x, t if t.dtype == x.dtype else None) for x, t in zip(values, tangents, strict=True)]
@@ -93,4 +91,4 @@ def _of_root(equation: Any, given: Moved) -> Moved:
     if right is None:
         return [(u, None)]
     slope = jacobian(lambda u: of_one_result(residual)(*values[:-1], u))(u)
-    return [(u, -(scaled_pseudo_inverse(slope) @ right))]
+    return [(u, -least_change(slope, right))]

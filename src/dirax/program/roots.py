@@ -7,14 +7,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.core import ShapedArray
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
-from jax.interpreters import ad
+from jax.interpreters import ad, batching
 from jaxtyping import Array, Float
 
 from dirax.numerics.newton import damped_step, sizes_of_unknowns
 from dirax.numerics.sparse import FEWEST_SPARSE
 from dirax.numerics.tolerances import TINY
-from dirax.program.given_tangents import implicit, implicit_tangent
+from dirax.program.given_tangents import Axes, implicit, implicit_tangent, lead_of, over, stays_one
 from dirax.program.linear_solves import equilibrated_inverse, scaled_pseudo_inverse
 from dirax.program.primitives import binds, plain_primitive
 from dirax.program.tracing import closed_over, jacobian
@@ -31,7 +32,7 @@ def nearest_root(residual: Callable, guess: Float[Array, " k"], max_steps: int =
     if binds(guess):
         closed, captured, result = closed_over(residual, [guess])
         if all(jnp.result_type(x) == jnp.float64 for x in (result, *captured)):
-            return root_p.bind(*captured, guess, residual=closed, max_steps=max_steps)[0]
+            return root_p.bind(*captured, guess, residual=closed, max_steps=max_steps, axes=())[0]
     residual, captured = jax.closure_convert(residual, guess)
     return _root(jax.jit(residual), max_steps, guess, *captured)
 
@@ -55,12 +56,41 @@ def _root(residual: Callable, max_steps: int, guess, *captured):
     root = lax.while_loop(unfinished, step, (lax.stop_gradient(guess), jnp.array(True), 0))[0]
     if sparse is not None:
         return sparse.root(lambda u: residual(u, *captured), root)
-    return implicit(lambda u, captured: residual(u, *captured), root, captured, _least_change)
+    return implicit(lambda u, captured: residual(u, *captured), root, captured, least_change)
 
 
-def _least_change(matrix, right):
-    """The solution of a linear system, regular or not, in the units of its equations and unknowns."""
-    return scaled_pseudo_inverse(matrix) @ right
+def least_change(matrix: Float[Array, "k k"], right: Float[Array, " k"]) -> Float[Array, " k"]:
+    """The solution of linear equations, regular or not, in the units of its equations and unknowns."""
+    return least_change_p.bind(matrix, right, axes=())[0] if binds(matrix, right) else scaled_pseudo_inverse(matrix) @ right
+
+
+def _least_change_by_jax(matrix, right, *, axes: Axes):
+    return [over(lambda matrix, right: scaled_pseudo_inverse(matrix) @ right, axes)(matrix, right)]
+
+
+def _least_change_tangents(primals, tangents, *, axes: Axes):
+    """x' of A x = b is the solution of A x' = b' − A'x."""
+    (matrix, right), (along_matrix, along_right) = primals, map(ad.instantiate_zeros, tangents)
+    (x,) = least_change_p.bind(matrix, right, axes=axes)
+    return [x], least_change_p.bind(matrix, along_right - over(jnp.matmul, axes)(along_matrix, x), axes=axes)
+
+
+def _least_change_transposed(along, matrix, right, *, axes: Axes):
+    return [None, least_change_p.bind(jnp.swapaxes(matrix, -1, -2), along[0], axes=axes)[0]]
+
+
+def _least_change_batched(operands, dimensions, *, axes: Axes):
+    """Right-hand sides have every axis."""
+    (matrix, right), (of_matrix, of_right) = operands, dimensions
+    if of_right is None:
+        right, of_right = jnp.broadcast_to(right, (matrix.shape[of_matrix], *right.shape)), 0
+    return stays_one(least_change_p)((matrix, right), (of_matrix, of_right), axes=axes)
+
+
+least_change_p = plain_primitive("dirax_least_change", _least_change_by_jax, lambda a, b, **_: [ShapedArray(b.shape, b.dtype)])
+ad.primitive_jvps[least_change_p] = _least_change_tangents
+ad.primitive_transposes[least_change_p] = _least_change_transposed
+batching.primitive_batchers[least_change_p] = _least_change_batched
 
 
 def _least_changes(equations: Callable) -> Callable:
@@ -117,20 +147,34 @@ def _unknowns_first(residual: ClosedJaxpr) -> Callable:
     return lambda u, *captured: jaxpr_as_fun(residual)(*captured, u)[0]
 
 
-def _by_jax(*operands, residual: ClosedJaxpr, max_steps: int):
-    *captured, guess = operands
-    return [_root(_unknowns_first(residual), max_steps, guess, *captured)]
+def _by_jax(*operands, residual: ClosedJaxpr, max_steps: int, axes: Axes):
+    one = lambda *operands: _root(_unknowns_first(residual), max_steps, operands[-1], *operands[:-1])
+    return [over(one, axes)(*operands)]
 
 
-def _root_p_tangents(primals, tangents, *, residual: ClosedJaxpr, max_steps: int):
-    if primals[-1].shape[0] >= FEWEST_SPARSE:
-        return _as_plain(primals, tangents, residual=residual, max_steps=max_steps)
-    u = root_p.bind(*primals, residual=residual, max_steps=max_steps)[0]
-    along = [None if isinstance(t, ad.Zero) else t for t in tangents[:-1]]
-    return [u], [implicit_tangent(_unknowns_first(residual), u, primals[:-1], along, _least_change)]
+def _shapes(*operands, residual: ClosedJaxpr, max_steps: int, axes: Axes):
+    (one,) = residual.out_avals
+    return [ShapedArray((*lead_of(operands, axes), *one.shape), one.dtype)]
 
 
-root_p = plain_primitive("dirax_root", _by_jax, lambda *operands, **_: [operands[-1]])
+def _root_p_tangents(primals, tangents, *, residual: ClosedJaxpr, max_steps: int, axes: Axes):
+    if residual.out_avals[0].shape[0] >= FEWEST_SPARSE:
+        return _as_plain(primals, tangents, residual=residual, max_steps=max_steps, axes=axes)
+    u = root_p.bind(*primals, residual=residual, max_steps=max_steps, axes=axes)[0]
+    moves, count = [not isinstance(t, ad.Zero) for t in tangents[:-1]], len(primals) - 1
+
+    def one(u, *given):
+        along = iter(given[count:])
+        directions = [next(along) if moved else None for moved in moves]
+        return implicit_tangent(_unknowns_first(residual), u, given[:count], directions, least_change)
+
+    levels = tuple((0, *level[:-1], *(a for a, moved in zip(level, moves, strict=False) if moved)) for level in axes)
+    along = (t for t, moved in zip(tangents, moves, strict=False) if moved)
+    return [u], [over(one, levels)(u, *primals[:-1], *along)]
+
+
+root_p = plain_primitive("dirax_root", _by_jax, _shapes)
 """The root of a jaxpr of (*captured, unknowns) from the last operand on, the others being what it captured."""
 _as_plain = ad.primitive_jvps[root_p]
 ad.primitive_jvps[root_p] = _root_p_tangents
+batching.primitive_batchers[root_p] = stays_one(root_p)

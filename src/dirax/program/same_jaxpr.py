@@ -43,7 +43,7 @@ def _equations(jaxpr: Jaxpr) -> tuple:
         return tuple([_constant(a.val) if isinstance(a, Literal) else numbers[a] for a in atoms])
 
     inputs = new([*jaxpr.constvars, *jaxpr.invars])
-    equations = [(e.primitive, read(e.invars), _value(e.params), new(e.outvars)) for e in jaxpr.eqns]
+    equations = [(e.primitive, read(e.invars), value_key(e.params), new(e.outvars)) for e in jaxpr.eqns]
     return len(jaxpr.constvars), inputs, tuple(equations), read(jaxpr.outvars)
 
 
@@ -58,14 +58,14 @@ def _constant(value: Any) -> Any:
     return type(value).__name__, array.dtype, array.shape, array.tobytes()
 
 
-def _value(value: Any) -> Any:
+def value_key(value: Any) -> Any:
     """A parameter of an equation, with the first of jaxprs that are alike; one that has no hash is like no other."""
     if isinstance(value, ClosedJaxpr):
         return Same(shared(value))
     if isinstance(value, Jaxpr):
         return _equations(value)
     if isinstance(value, dict):
-        return tuple([(name, _value(one)) for name, one in value.items()])
+        return tuple([(name, value_key(one)) for name, one in value.items()])
     if isinstance(value, tuple | list):
-        return tuple([_value(one) for one in value])
+        return tuple([value_key(one) for one in value])
     return _constant(value) if isinstance(value, np.ndarray | float) else (type(value), value)

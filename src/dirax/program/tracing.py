@@ -163,6 +163,13 @@ def closed_over(function: Callable, values: list) -> tuple[ClosedJaxpr, list, An
     return shared(ClosedJaxpr(jaxpr, fixed)), [value for _, value, traced in pairs if traced], result
 
 
+def alone(jaxpr: Any, equation: Any) -> tuple[ClosedJaxpr, list[Var]]:
+    """One equation of a jaxpr as a jaxpr of the variables in it."""
+    variables = list(dict.fromkeys(atom for atom in equation.invars if isinstance(atom, Var)))
+    one = jaxpr.replace(constvars=(), invars=variables, outvars=equation.outvars, eqns=[equation])
+    return ClosedJaxpr(one, ()), variables
+
+
 def all_plain(jaxpr: Any) -> bool:
     """Whether the graph has the same derivative as JAX of all that a jaxpr does; what leads to comparisons alone has none."""
     moving = {v for v in jaxpr.outvars if _has_derivative(v)}

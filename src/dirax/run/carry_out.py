@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.engines.contract import Outcome, Problem
+from dirax.engines.lifted import lifted
 from dirax.numerics.one_thread import one_thread
 from dirax.program.captured import refuse_changed
 from dirax.program.memo import Memo, patience
@@ -220,6 +221,7 @@ def _begun(settings: Settings, case: Case, steps: int, save_every: int, asked: i
     if not traced:
         complete = {name: a if case.batch is None else a[0] for name, a in initial.data.items()}
         refuse_wrong_shapes(equation, {**complete, "t": np.asarray(case.t0)}, case.h, own)
+    equation = lifted(equation, case.params, case.batch_params)
     start = begun(equation, case, initial, by_jax)
     # user functions that close over a traced value make the start traced although nothing that was passed is
     if not (traced := traced or is_traced(start)):

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dirax.engines.lifted import lifted
 from dirax.program.compiled import compiled
 from dirax.program.evaluation.functions import in_numpy
 from dirax.program.hoisted import split
@@ -399,4 +400,4 @@ def equation_of(sol: Trajectory) -> Any:
     one = {name: a[0] if a.ndim == 2 else a for name, a in sol.initial.items()}
     redundant = tuple(sol.stats.get("redundant_constraints", ()))
     shape = Shape(*sol.system.sizes(one, sol.params_of_one), redundant=redundant)
-    return make_step_equation(sol.scheme, sol.system, shape)
+    return lifted(make_step_equation(sol.scheme, sol.system, shape), sol.params, sol.batch_params)

@@ -91,6 +91,8 @@ def _affine_root(interpreter: Interpreter, equation: Any, *operands: Nodes) -> l
     """The root of equations that are affine in their unknowns, such as p = ∂L/∂v for a kinetic energy: by one elimination, and
     once more for what rounding left."""
     closed, g = equation.params["residual"], interpreter.graph
+    if equation.params["axes"]:
+        raise Unsupported("is one of many side by side")
     *captured, root = operands
     slope = jax.make_jaxpr(jacobian(of_one_result(closed), len(captured)))(*closed.in_avals)
     first = len(g)

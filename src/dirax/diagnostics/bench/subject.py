@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.engines.contract import Outcome, Problem
+from dirax.engines.lifted import lifted
 from dirax.run.start import begun, completed
 from dirax.run.validate import Case, initial_data
 from dirax.schemes.step import AbstractScheme, Shape, make_step_equation
@@ -81,7 +82,7 @@ class Subject:
         equation = make_step_equation(self.scheme, self.system, Shape(*self.system.sizes(self.arrays, self.leaves)))
         if len(equation.stages) > 1:
             raise Skipped("the scheme is a composition")
-        return equation
+        return lifted(equation, self.leaves, False)
 
     @cached_property
     def one(self) -> Problem:

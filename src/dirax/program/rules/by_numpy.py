@@ -14,6 +14,7 @@ from dirax.numerics.newton import damped_step, sizes_of_unknowns
 from dirax.numerics.sparse import FEWEST_SPARSE
 from dirax.numerics.tolerances import EQUATION_RANK, TINY
 from dirax.program.evaluation.in_numpy import LANES, Slopes, Values, in_parts
+from dirax.program.given_tangents import Axes
 from dirax.program.graph import GraphTooLarge
 from dirax.program.interpreter import RULES, Interpreter, Nodes, Unavailable, Unsupported, UnsupportedPrimitive
 from dirax.program.linear_solves import equilibrated_inverse, pseudo_inverses
@@ -161,6 +162,17 @@ def solved_by_numpy(made: ScalarProgram, interpreter: Interpreter, equation: Any
     return made.between([matrix, right], [right.shape], lambda operands: [solved(*operands)], "solve")
 
 
+@numpy_rule("dirax_least_change")
+def least_change(made: ScalarProgram, interpreter: Interpreter, equation: Any, matrix: Nodes, right: Nodes) -> list[Nodes]:
+    axes, k = equation.params["axes"], right.shape[-1]
+
+    def solutions(arrays: list[np.ndarray]) -> list[np.ndarray]:
+        (inverse, _), sides = _inverted(arrays[0].reshape(-1, k, k)), arrays[1].reshape(-1, k)
+        return [(inverse @ sides[..., None])[..., 0].reshape(arrays[1].shape)]
+
+    return made.between([_in_front(matrix, axes, 0, right.shape[: len(axes)]), right], [right.shape], solutions, "least change")
+
+
 @numpy_rule("dirax_pseudo_inverse")
 def pseudo_inverse(made: ScalarProgram, interpreter: Interpreter, equation: Any, matrix: Nodes) -> list[Nodes]:
     inverse = functools.partial(pseudo_inverses, tolerance=equation.params["tolerance"])
@@ -279,4 +291,20 @@ def root(made: ScalarProgram, interpreter: Interpreter, equation: Any, *operands
             going = going[more]
         return [found]
 
-    return made.between(list(operands), [equation.outvars[0].aval.shape], lambda arrays: in_parts(find, arrays, most))
+    axes, (result,) = equation.params["axes"], [v.aval.shape for v in equation.outvars]
+    given = [*closed.in_avals[:-1], closed.out_avals[0]]  # the guess has the shape of the residual
+    lead = result[: len(axes)]
+
+    def side_by_side(arrays: list[np.ndarray]) -> list[np.ndarray]:
+        entries, count = len(arrays[0]), len(arrays[0]) * math.prod(lead)
+        one = [a.reshape(count, *aval.shape) for a, aval in zip(arrays, given, strict=True)]
+        return [in_parts(find, one, most)[0].reshape(entries, *result)]
+
+    return made.between([_in_front(nodes, axes, k, lead) for k, nodes in enumerate(operands)], [result], side_by_side)
+
+
+def _in_front(nodes: Nodes, axes: Axes, number: int, lead: tuple[int, ...]) -> Nodes:
+    """An operand that went through `jax.vmap`s, with all axes of them, which are `lead` long."""
+    has = [level[number] is not None for level in reversed(axes)]
+    own = nodes.shape[sum(has) :]
+    return np.broadcast_to(nodes.reshape(*(n if h else 1 for n, h in zip(lead, has, strict=True)), *own), (*lead, *own))
