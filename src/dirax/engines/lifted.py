@@ -35,7 +35,7 @@ _lifted: Memo[StepEquation | StepSequence] = Memo(128)
 
 def lifted(equation: Any, params: Any, batch_params: bool) -> Any:
     """The equation of the same step with the roots inside of it among its unknowns; itself where there is none, where they are
-    many, or lie in loops or branches, and where its functions read values that JAX traces."""
+    many, not determined by their equations, or in loops or branches, and where its functions read values that JAX traces."""
     try:
         p = parameters(params, batch_params)
     except UnsupportedPrimitive:
@@ -61,7 +61,7 @@ def _of_stage(stage: StepEquation, p: Parameters) -> StepEquation:
         return stage
     step = LiftedStep(stage, p, inside)
     few = stage.unknowns + inside.size < FEWEST_SPARSE
-    return step.equation() if few and not step.looks_back else stage
+    return step.equation() if few and not step.looks_back and inside.are_regular else stage
 
 
 class LiftedStep:

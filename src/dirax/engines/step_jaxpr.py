@@ -16,8 +16,8 @@ _jaxprs: Memo[ClosedJaxpr] = Memo(KEPT)
 
 
 def step_jaxpr(equation: Any, p: Parameters) -> ClosedJaxpr:
-    """(u, state, previous, t, h, parameters) ↦ guess, residual, advance and the fields of a row in the order of their names, of one
-    StepEquation."""
+    """(u, state, previous, t, h, parameters) ↦ guess, residual, advance and the fields of a row in the order of their names,
+    of one StepEquation."""
     return _jaxprs.get((Same(equation), p.key), lambda: _traced(equation, p))
 
 

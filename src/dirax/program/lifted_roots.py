@@ -11,12 +11,16 @@ from jax.core import ShapedArray, Tracer
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Var, jaxpr_as_fun, jaxprs_in_params
 from jax.interpreters.partial_eval import dce_jaxpr
 
+from dirax.numerics.ranks import rank_of_equations
 from dirax.program.given_tangents import Axes, at_place, lead_of, over
+from dirax.program.graph import GraphTooLarge
+from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.program.linear_solves import solve
 from dirax.program.memo import Memo, Same, by_value
 from dirax.program.roots import least_change_p, root_p
 from dirax.program.same_jaxpr import value_key
-from dirax.program.tracing import alone, of_one_result
+from dirax.program.scalar_program import ScalarProgram
+from dirax.program.tracing import alone, jacobian, of_one_result
 
 CALLS = ("jit", "pjit", "closed_call")
 """Primitives that do no more than their jaxpr says."""
@@ -24,7 +28,13 @@ CALLS = ("jit", "pjit", "closed_call")
 SIDE_BY_SIDE = 64
 """Roots of one kind whose equations are written one after the other, with derivatives that stay one equation each."""
 
-_asked: Memo[bool] = Memo(512)
+NEAR = 0.1, 0.5
+"""Numbers at which functions are tried: small, as for relativistic velocities, and for the exponentials of diodes."""
+
+PLACES = 3
+"""How many of them."""
+
+_asked: Memo[frozenset] = Memo(512)
 
 
 class Unliftable(Exception):
@@ -68,6 +78,29 @@ class LiftedJaxpr:
         """The roots, found."""
         return jaxpr_as_fun(self.of_operands)(*operands)
 
+    @property
+    def are_regular(self) -> bool:
+        """Whether the equations of the roots determine them, at one of some places chosen at random that is in their domain; so
+        they are said to be where none is, and where they have no scalar program."""
+        defect = self.part(self.results)
+        shapes = [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in self._all.in_avals]
+
+        def of_roots(numbers: Any, *operands: Any) -> Any:
+            ends = np.cumsum([a.size for a in self.kinds])[:-1]
+            roots = [jnp.reshape(one, a.shape) for one, a in zip(jnp.split(numbers, ends), self.kinds, strict=True)]
+            return defect([*roots, *operands])[0]
+
+        try:
+            numbers = jax.ShapeDtypeStruct((self.size,), np.float64)
+            slope = ScalarProgram.of(jax.make_jaxpr(jacobian(of_roots))(numbers, *shapes[len(self.kinds) :]), by_numpy=True)
+        except (UnsupportedPrimitive, GraphTooLarge):
+            return True
+        random = np.random.default_rng(0).uniform
+        with np.errstate(all="ignore"):
+            (matrices,) = slope.in_numpy([random(*NEAR, (PLACES, *a.shape)) for a in [numbers, *shapes[len(self.kinds) :]]])
+        finite = matrices[np.all(np.isfinite(matrices), axis=(1, 2))]
+        return not len(finite) or int(np.max(rank_of_equations(finite)[0])) == self.size
+
     def part(self, *results: int) -> Part:
         """(roots, operands) ↦ results of these numbers; the last one is what vanishes at the roots, (size,)."""
         jaxpr, used = dce_jaxpr(self._all.jaxpr, [k in results for k in range(self.results + 1)])[:2]
@@ -75,12 +108,18 @@ class LiftedJaxpr:
 
 
 def has_roots(jaxpr: Any) -> bool:
-    """Whether a jaxpr, or one inside of it, asks for a root or a derivative of one."""
-    return _asked.get(Same(jaxpr), lambda: any(e.primitive in (root_p, least_change_p) or _inside(e) for e in jaxpr.eqns))
+    """Whether a jaxpr, or one inside of it, asks for a root."""
+    return root_p in _asked_by(jaxpr)
 
 
-def _inside(equation: Any) -> bool:
-    return any(has_roots(getattr(j, "jaxpr", j)) for j in jaxprs_in_params(equation.params))
+def _asked_by(jaxpr: Any) -> frozenset:
+    """Which of the primitives that are roots or derivatives of them a jaxpr has, or one inside of it."""
+    every = lambda: frozenset().union(*(_asked_in(e) | ({e.primitive} & {root_p, least_change_p}) for e in jaxpr.eqns))
+    return _asked.get(Same(jaxpr), every)
+
+
+def _asked_in(equation: Any) -> frozenset:
+    return frozenset().union(*(_asked_by(getattr(j, "jaxpr", j)) for j in jaxprs_in_params(equation.params)))
 
 
 class _Walk:
@@ -107,7 +146,7 @@ class _Walk:
         return [read(atom) for atom in closed.jaxpr.outvars]
 
     def _equation(self, jaxpr: Jaxpr, equation: Any, operands: list) -> list:
-        if equation.primitive is not root_p and _inside(equation):
+        if equation.primitive is not root_p and _asked_in(equation):
             if equation.primitive.name not in CALLS:
                 raise Unliftable
             return self._through(equation.params["jaxpr"], operands)

@@ -307,4 +307,5 @@ def _in_front(nodes: Nodes, axes: Axes, number: int, lead: tuple[int, ...]) -> N
     """An operand that went through `jax.vmap`s, with all axes of them, which are `lead` long."""
     has = [level[number] is not None for level in reversed(axes)]
     own = nodes.shape[sum(has) :]
-    return np.broadcast_to(nodes.reshape(*(n if h else 1 for n, h in zip(lead, has, strict=True)), *own), (*lead, *own))
+    mine = (n if h else 1 for n, h in zip(lead, has, strict=True))
+    return np.broadcast_to(nodes.reshape((*mine, *own)), (*lead, *own))
