@@ -81,6 +81,7 @@ class LiftedStep:
     def equation(self) -> StepEquation:
         """The equation of the lifted step."""
         stage, kinds, inner = self.stage, self.inside.kinds, self.stage.interpolate
+        layout = Layout(**stage.unknown_layout, **{f"root_{j}": a.shape for j, a in enumerate(kinds)})
         labels = (Labels.numbered(f"equation {{}} of root {j} inside of the step", a.size) for j, a in enumerate(kinds))
         interpolate = None if inner is None else lambda theta, u, *others: inner(theta, u[: stage.unknowns], *others)
         return dataclasses.replace(
@@ -92,8 +93,8 @@ class LiftedStep:
             unpack=self.unpack,
             guess=self.guess,
             interpolate=interpolate,
-            unknowns=None,
-            unknown_layout=Layout(**stage.unknown_layout, **{f"root_{j}": a.shape for j, a in enumerate(kinds)}),
+            unknowns=layout.size,
+            unknown_layout=layout,
             labels=[*stage.labels, *(name for names in labels for name in names)],
             collocation=None,
             weak=(),
