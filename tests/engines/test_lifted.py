@@ -65,9 +65,10 @@ def test_its_derivatives_are_those_of_the_formula_of_the_root():
 
 def test_engines_agree_on_a_batch_with_parameters_of_its_own():
     momenta, scales = np.outer([1.0, 0.9, 0.5], MOMENTUM), np.array([1.3, 1.5, 1.1])
-    native, xla = (run(BY_ROOTS, SCHEMES["discrete Dirac"], momenta, scales, engine=e) for e in ("native", "xla"))
-    assert native.x == pytest.approx(xla.x, abs=1e-14)
-    assert native.x == pytest.approx(run(BY_FORMULA, SCHEMES["discrete Dirac"], momenta, scales).x, abs=1e-13)
+    of = lambda system, engine: run(system, SCHEMES["discrete Dirac"], momenta, scales, engine=engine, batch_params=True)
+    native = of(BY_ROOTS, "native")
+    assert native.x == pytest.approx(of(BY_ROOTS, "xla").x, abs=1e-14)
+    assert native.x == pytest.approx(of(BY_FORMULA, "native").x, abs=1e-13)
 
 
 def of_circuit(netlist, count):

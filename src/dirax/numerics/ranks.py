@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from operator import mul
 from types import ModuleType
 from typing import Any
 
@@ -65,20 +66,21 @@ SMALL = 8
 20 µs."""
 
 
-def surely_independent(rows: Sequence[Sequence[float]], most: float = SURE) -> bool:
-    """Whether the rows of a matrix (k, l), which someone has scaled, are independent beyond doubt: the product of its norm and
-    that of a right inverse, which is no less than its condition number, is below `most`. False also where it is not finite.
+def surely_independent(entries: Sequence[float], k: int, most: float = SURE) -> bool:
+    """Whether the rows of a matrix (k, l), which someone has scaled, its entries row by row, are independent beyond doubt: the
+    product of its norm and that of a right inverse, which is no less than its condition number, is below `most`. False also where
+    it is not finite.
 
     The scaling of `rank_of_equations` is as good as any up to a factor √k (van der Sluis 1969), and its decision the same.
     """
-    k, norm = len(rows), sum([x * x for row in rows for x in row])
+    norm = sum(map(mul, entries, entries))
     if k == 1:
         return 0.0 < norm < math.inf
-    if k == len(rows[0]):
-        return norm * _inverse_norm(rows) < most * most
-    matrix = np.array(rows)
+    if k * k == len(entries):
+        return norm * _inverse_norm(entries, k) < most * most
+    matrix = np.array(entries).reshape(k, -1)
     with np.errstate(all="ignore"):
-        inverse_norm = _inverse_norm((matrix @ matrix.T).tolist())
+        inverse_norm = _inverse_norm((matrix @ matrix.T).ravel().tolist(), k)
         # ‖Aᵀ(AAᵀ)⁻¹‖² ≤ √k ‖(AAᵀ)⁻¹‖, all by Frobenius' norm
         return bool(norm * math.sqrt(k * inverse_norm) < most * most)
 
@@ -109,20 +111,19 @@ def _inverse_norms(matrices: np.ndarray) -> np.ndarray:
     return np.einsum("bkl,bkl->b", inverses, inverses)
 
 
-def _inverse_norm(rows: Sequence[Sequence[float]]) -> float:
-    """The sum of the squares of the entries of the inverse of a square matrix; infinite where it has none."""
-    k = len(rows)
+def _inverse_norm(entries: Sequence[float], k: int) -> float:
+    """The sum of the squares of the entries of the inverse of a square matrix (k, k); infinite where it has none."""
     if k == 2:
-        (a, b), (c, d) = rows
+        a, b, c, d = entries
         determinant = a * d - b * c
         return (a * a + b * b + c * c + d * d) / determinant / determinant if determinant else math.inf
     if k > SMALL:
         try:
-            inverse = np.linalg.inv(np.array(rows))
+            inverse = np.linalg.inv(np.array(entries).reshape(k, k))
         except np.linalg.LinAlgError:
             return math.inf
         return float(np.vdot(inverse, inverse))
-    both = [[*row, *[float(i == j) for j in range(k)]] for i, row in enumerate(rows)]
+    both = [[*entries[k * i : k * i + k], *[float(i == j) for j in range(k)]] for i in range(k)]
     for i in range(k):
         pivot = max(range(i, k), key=lambda j: abs(both[j][i]))
         both[i], both[pivot] = both[pivot], both[i]

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from operator import mul
 from typing import Any, TypeAlias
 
 import jax
@@ -45,14 +46,14 @@ class Plan:
         self.first_step: Any = None
         self.data_size = sum(np.size(a) for a in jax.tree.leaves(initial.data))
         self.defects, self.has_lagrangian = np.size(initial.defect), initial.lagrangian is not None
-        self.matrix: list[list[float]] | None = None
+        self.matrix: list[float] | None = None
         if initial.constraints is not None and np.size(initial.constraints):
-            self.matrix = scales_of(np.asarray(initial.constraints)).tolist()
+            self.rows, self.matrix = len(initial.constraints), scales_of(np.asarray(initial.constraints)).ravel().tolist()
         self.state_size, self.guesses = len(start.state), [len(guess) for guess in start.guess]
         self.fraction, self.unknowns = equation.stages[0][1], equation.stages[0][0].unknowns
         if self.unknowns:
             self.first_step, self.moving = program_of_first_step(equation, case)
-            self.jacobian = scales_of(np.asarray(start.jacobian)).tolist()
+            self.jacobian = scales_of(np.asarray(start.jacobian)).ravel().tolist()
         self.asks_hessian = asks_hessian(settings.system, shape, case)
         self.hessian: Floats | None = None
         self.places = _places(initial.data)
@@ -67,7 +68,7 @@ class Plan:
         """The problem of a case; None where a premise is in doubt."""
         if not self.premise.holds(case, self.regular):
             return None
-        leaves = jax.tree.leaves(case.params)
+        leaves = case.leaves
         data = [x for name in self.names for x in case.data[name].tolist()]
         last = [*(x for leaf in leaves for x in leaf.ravel().tolist()), case.h, case.t0]
         try:
@@ -107,7 +108,8 @@ class Plan:
             return False
         if self.matrix is None:
             return True
-        return surely_independent(_scaled(initial[at + self.has_lagrangian :], self.matrix), SURELY_REGULAR)
+        scaled = list(map(mul, initial[at + self.has_lagrangian :], self.matrix))
+        return surely_independent(scaled, self.rows, SURELY_REGULAR)
 
     def _steps(self, start: Sequence[float], case: Case, leaves: list[Any]) -> bool:
         """Whether the start is finite, and the first step has a unique solution."""
@@ -118,7 +120,7 @@ class Plan:
             return True
         params = [x for leaf, moves in zip(leaves, self.moving, strict=True) if moves for x in leaf.ravel().tolist()]
         found = self.first_step((*start[s : s + k], *start[:s], case.t0, self.fraction * case.h, *params))
-        return math.isfinite(sum(found[:k])) and surely_independent(_scaled(found[k:], self.jacobian))
+        return math.isfinite(sum(found[:k])) and surely_independent(list(map(mul, found[k:], self.jacobian)), k)
 
     def _has_regular_hessian(self, complete: Sequence[float], case: Case, last: Sequence[float]) -> bool:
         """Whether ∂²L/∂v² is regular; what is so once is not asked again for the same params."""
@@ -132,7 +134,7 @@ class Plan:
         if self.hessian is None:
             return False
         entries, n = self.hessian((case.t0, *q, *v, *last[:-2])), len(q)
-        regular = surely_independent([entries[i * n : i * n + n] for i in range(n)], SURELY_REGULAR)
+        regular = surely_independent(entries, n, SURELY_REGULAR)
         if regular:
             self.learn(case.params)
         return regular
@@ -159,12 +161,6 @@ def planned(settings: Settings, case: Case, shape: Shape, initial: Initial, star
     _ = problem.fields, problem.row_size, problem.review  # found once: others are made of this one
     plan = made(settings, case, shape, initial, start, problem)
     return plan if plan.whole else None
-
-
-def _scaled(entries: Sequence[float], scales: list[list[float]]) -> list[list[float]]:
-    """The rows of a matrix with these entries, each times its scale."""
-    width = len(scales[0])
-    return [[x * y for x, y in zip(entries[i * width :], row, strict=False)] for i, row in enumerate(scales)]
 
 
 def _places(data: dict[str, Any]) -> dict[str, slice]:

@@ -5,6 +5,7 @@ import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +52,11 @@ class Case:
     redundant: tuple[int, ...] = ()
     """Of a case with traced values: the constraints that are known to follow from others."""
 
+    @cached_property
+    def leaves(self) -> list[Any]:
+        """The leaves of the params."""
+        return jax.tree.leaves(self.params)
+
     @property
     def first(self) -> tuple[dict[str, Any], Any]:
         """Data and parameters of the first trajectory."""
@@ -69,7 +75,7 @@ class Case:
     @property
     def plain(self) -> bool:
         """Whether all values are numbers and NumPy's arrays."""
-        leaves = (*self.data.values(), *jax.tree.leaves(self.params))
+        leaves = (*self.data.values(), *self.leaves)
         numbers = type(self.h) is type(self.t0) is float
         return numbers and all([type(leaf) is np.ndarray for leaf in leaves])
 
