@@ -72,7 +72,7 @@ class Kind:
         if numbers is None or found.case is not case:
             return
         while len(self.starts) >= STARTS:
-            self.starts.pop(next(iter(tuple(self.starts)), None), None)
+            self.starts.pop(next(iter(tuple(self.starts))), None)
         self.starts[numbers] = found
 
 

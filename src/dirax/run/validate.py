@@ -5,7 +5,6 @@ import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -52,10 +51,10 @@ class Case:
     redundant: tuple[int, ...] = ()
     """Of a case with traced values: the constraints that are known to follow from others."""
 
-    @cached_property
+    @property
     def leaves(self) -> list[Any]:
         """The leaves of the params."""
-        return jax.tree.leaves(self.params)
+        return [] if self.params is None else jax.tree.leaves(self.params)
 
     @property
     def first(self) -> tuple[dict[str, Any], Any]:
