@@ -15,8 +15,8 @@ import jax.numpy as jnp
 from jax.core import Tracer
 
 from dirax.engines.parameters import Parameters, parameters
+from dirax.engines.policy import LARGEST_NATIVE
 from dirax.engines.step_jaxpr import step_jaxpr
-from dirax.numerics.sparse import FEWEST_SPARSE
 from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.program.lifted_roots import LiftedJaxpr, Part, Unliftable, has_roots
 from dirax.program.memo import Memo, Same
@@ -60,7 +60,7 @@ def _of_stage(stage: StepEquation, p: Parameters) -> StepEquation:
     except Unliftable:
         return stage
     step = LiftedStep(stage, p, inside)
-    few = stage.unknowns + inside.size < FEWEST_SPARSE
+    few = stage.unknowns + inside.size <= LARGEST_NATIVE
     return step.equation() if few and not step.looks_back and inside.are_regular else stage
 
 
