@@ -14,6 +14,7 @@ from dirax.diagnostics.rows import consecutive, over_rows, sampled_rows, shape_o
 from dirax.diagnostics.symplecticity_of_many import symplecticity_of_many
 from dirax.diagnostics.verdicts import judged, of_lane, roundoff_limit, spread, where_reached, worst_place
 from dirax.engines.steps_in_numbers import StepsInNumbers
+from dirax.numerics.tolerances import SMALLEST
 from dirax.program.evaluation.noise import Noise
 from dirax.program.memo import Same
 from dirax.schemes.discrete_structure import AbstractDiscreteStructure, AbstractStepForm
@@ -199,7 +200,7 @@ def _terms_of_form(form: AbstractStepForm, same: Same, rows, step, params):
 def _of_terms(terms: np.ndarray) -> np.ndarray:
     """The numbers (B, rows, numbers) of terms: the largest of what is missed, each relative to the size of its terms."""
     missed, sizes = np.abs(terms[..., 0, :]), terms[..., 1, :]
-    return np.max(np.divide(missed, sizes, out=missed.copy(), where=sizes > 0.0), axis=-1)
+    return np.max(np.divide(missed, sizes, out=missed.copy(), where=sizes > SMALLEST), axis=-1)
 
 
 def _unsaved(reads: tuple[str, ...], sol: Solution) -> str:

@@ -33,10 +33,10 @@ import numpy as np
 from dirax.engines.close_sizes import MOST, Entries, close_sizes, sizes_at
 from dirax.engines.contract import Problem
 from dirax.engines.first_sizes import FAR, first_sizes
+from dirax.engines.policy import LARGEST_NATIVE
 from dirax.engines.step_program import step_program
 from dirax.engines.steps_in_numbers import StepsInNumbers
 from dirax.numerics.equilibration import power_of_two
-from dirax.numerics.sparse import FEWEST_SPARSE
 from dirax.numerics.tolerances import TINY
 from dirax.program.compiled import compiled
 from dirax.program.graph import GraphTooLarge
@@ -50,7 +50,7 @@ Sizes = tuple[Any, ...]
 
 def sizes_of(problem: Problem) -> Sizes:
     """The sizes of the unknowns of each stage, (k,) or (B, k), of a problem in numbers."""
-    if problem.size >= FEWEST_SPARSE:
+    if problem.size > LARGEST_NATIVE:
         return _of_many(problem)
     return _in_numbers(problem, _start(problem), _looked_at)
 
@@ -58,7 +58,7 @@ def sizes_of(problem: Problem) -> Sizes:
 def sizes_of_traced(problem: Problem) -> Sizes:
     """The same of a problem that JAX traces, without derivatives: in numbers when it runs, where the step has a scalar program,
     since XLA takes seconds to compile them."""
-    if problem.size >= FEWEST_SPARSE:
+    if problem.size > LARGEST_NATIVE:
         return _of_many(problem, traced=True)
     found = _on_host(problem)
     if found is None:
@@ -92,7 +92,7 @@ def grown(problem: Problem, lanes: np.ndarray, completed: np.ndarray, state: np.
 def _next_step(p: Problem, lanes: np.ndarray, completed: np.ndarray, state: np.ndarray, guess: tuple) -> tuple[tuple, Any]:
     """The unknowns of each stage in the step that leaves `state`, and where it has a solution; of steps that cannot be taken in
     numbers the guess."""
-    steps = StepsInNumbers.found(p.equation, p.params, p.batch_params) if p.size < FEWEST_SPARSE else None
+    steps = StepsInNumbers.found(p.equation, p.params, p.batch_params) if p.size <= LARGEST_NATIVE else None
     if steps is None:
         return guess, np.ones(len(lanes), bool)
     params = steps.parameters(p.params, p.batch if p.batch_params else None, lanes)
@@ -103,7 +103,7 @@ def _next_step(p: Problem, lanes: np.ndarray, completed: np.ndarray, state: np.n
 def sizes_there(problem: Problem, lanes: np.ndarray, completed: np.ndarray, state: np.ndarray, guess: tuple) -> Sizes:
     """The sizes of some trajectories where they stand, looked at closely; arguments as above."""
     p = problem
-    if p.size >= FEWEST_SPARSE:
+    if p.size > LARGEST_NATIVE:
         return tuple(np.ones((len(lanes), np.shape(u)[-1])) for u in guess)
     moved = lambda a: np.asarray(a)[lanes] if p.batch is not None else np.asarray(a)[None][lanes]
     params = jax.tree.map(moved, p.params) if p.batch_params else p.params

@@ -13,7 +13,7 @@ from dirax.engines.step_program import KEPT, StepProgram, step_program
 from dirax.engines.stopping import CONTRACTING, FLOOR, OWN, STALLED
 from dirax.numerics.equilibration import balanced_inverse, balancing_scales, condition_number, largest_of_few
 from dirax.numerics.inverses import Inverses, applied, applied_sizes, inverted, no_inverses, unknown
-from dirax.numerics.tolerances import EPSILON
+from dirax.numerics.tolerances import SMALLEST
 from dirax.program.evaluation.in_numpy import LANES, Slopes, Values
 from dirax.program.evaluation.noise import Noise
 from dirax.program.evaluation.read_again import ReadAgain
@@ -30,9 +30,6 @@ ARRIVALS = 3 * [(True, False)] + 3 * [(True, True)] + 5 * [(False, True)]
 
 SINGULAR = 1e-10
 """Relative singular values that count as zero in them."""
-
-SMALLEST = float(np.finfo(float).tiny) / EPSILON
-"""Numbers below this do not have all their digits, and count as zero."""
 
 
 @dataclass

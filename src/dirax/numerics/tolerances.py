@@ -7,6 +7,9 @@ it runs to the roundoff floor, see `dirax.engines.stopping`.
 EPSILON = 2.0**-52
 """The distance from 1 to the next number."""
 
+SMALLEST = 2.0**-1022 / EPSILON
+"""Numbers below this do not have all their digits, or come of products that do not, and count as zero."""
+
 TINY = 1e-300
 """Stands in for a size that is zero, where one divides by it or compares with it."""
 

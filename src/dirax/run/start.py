@@ -75,9 +75,8 @@ def begun(equation: Any, case: Case, initial: Initial, by_jax: bool = False) -> 
     start = _of_every(_Beginning(equation, case.two_points), (equation,), case, initial.data, by_jax)
     if not equation.stages[0][0].unknowns or case.traced or is_traced(start):  # what is traced cannot be checked
         return start
-    of_nodes = equation.stages[0][0].collocation is not None and not begins_by_arrays(case)  # many unknowns of few coordinates
-    unknowns = equation.stages[0][0].unknowns
-    if unknowns >= FEWEST_SPARSE and not (of_nodes and unknowns**2 <= LARGEST_MATRIX):
+    unknowns, few_coordinates = equation.stages[0][0].unknowns, not begins_by_arrays(case)
+    if unknowns >= FEWEST_SPARSE and not (few_coordinates and unknowns**2 <= LARGEST_MATRIX):
         return _with_sparse_first_step(equation, case, start)
     first = None if by_jax else _first_step_in_numbers(equation, case, start)
     if first is None:
