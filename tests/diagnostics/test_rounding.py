@@ -8,7 +8,7 @@ import dirax as dx
 from dirax import gallery
 from dirax.diagnostics.replay_lines import replayed
 from dirax.diagnostics.rounding import DISTURBANCE
-from dirax.diagnostics.structure_lines import symplecticity
+from dirax.diagnostics.structure_lines import of_terms, symplecticity
 from dirax.program.evaluation.functions import in_numpy
 from dirax.program.evaluation.noise import Noise
 
@@ -58,3 +58,9 @@ def test_a_decomposition_in_the_potential_is_no_violation():
     sol = run(lambda q: jnp.sum(jnp.abs(jnp.fft.fft(jnp.stack([q[0], q[1], 1.0, 2.0]))) ** 2) / 10)
     line = symplecticity(sol, None)
     assert line.quantity == "symplecticity of one step" and line.verdict == "ok"
+
+
+def test_derivatives_that_underflow_are_no_violation():
+    """Ends of a long chain hardly move each other in a step: terms that have few digits, or that XLA takes for zero, miss."""
+    missed, sizes = [1e-17, 4e-308, 0.0], [1.0, 8e-306, 0.0]
+    assert of_terms(np.array([[[[missed, sizes]]]])) == 1e-17

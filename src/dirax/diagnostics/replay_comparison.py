@@ -4,8 +4,8 @@ from functools import cached_property
 
 import numpy as np
 
-from dirax.numerics.tolerances import SMALLEST
 from dirax.diagnostics.replay import Again, Replay, Rows, times_of
+from dirax.numerics.tolerances import SMALLEST
 from dirax.program.evaluation.noise import Noise
 
 DISTURBANCE = 2.0**-36

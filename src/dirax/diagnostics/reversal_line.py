@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from dirax.numerics.tolerances import SMALLEST
 from dirax.diagnostics.replay import CannotReplay, Replay
 from dirax.diagnostics.replay_comparison import DISTURBANCE, OFTEN
 from dirax.diagnostics.report import NOT_CHECKED, OK, Line
 from dirax.diagnostics.verdicts import judged, of_lane, roundoff_limit, spread
+from dirax.numerics.tolerances import SMALLEST
 from dirax.program.evaluation.noise import Noise
 from dirax.solution.solution import Solution
 

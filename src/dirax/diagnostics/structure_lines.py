@@ -163,12 +163,12 @@ def symplecticity(sol: Solution, tolerance: float | None) -> Line:
     terms, conditions = stepped()
     condition = float(np.max(conditions, where=np.isfinite(conditions), initial=1.0))
     limit = roundoff_limit(tolerance, size * condition)
-    values = _of_terms(terms)
+    values = of_terms(terms)
     if np.any(values[..., 0] > limit):
         moved = differences_by_rounding(terms, lambda noise: stepped(noise)[0])
         limit *= 1.0 if StepsInNumbers.found(sol.equation, sol.given_params, sol.batch_params) is not None else UNDISTURBED
         terms[..., 1, :] = np.maximum(terms[..., 1, :], np.max(np.abs(moved), axis=0)[..., 0, :])
-        values = _of_terms(terms)
+        values = of_terms(terms)
     defect = values[..., 0]
     if not np.any(np.isfinite(defect)):
         return Line(name, None, None, NOT_CHECKED, "the step could not be solved again from the saved rows")
@@ -197,7 +197,7 @@ def _terms_of_form(form: AbstractStepForm, same: Same, rows, step, params):
     return form.terms(step, same.object, rows, params)
 
 
-def _of_terms(terms: np.ndarray) -> np.ndarray:
+def of_terms(terms: np.ndarray) -> np.ndarray:
     """The numbers (B, rows, numbers) of terms: the largest of what is missed, each relative to the size of its terms."""
     missed, sizes = np.abs(terms[..., 0, :]), terms[..., 1, :]
     return np.max(np.divide(missed, sizes, out=missed.copy(), where=sizes > SMALLEST), axis=-1)

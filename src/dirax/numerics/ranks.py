@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from contextlib import nullcontext
 from operator import mul
 from types import ModuleType
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from dirax.numerics.equilibration import equilibrated, geometric_scales
+from dirax.numerics.one_thread import one_thread
 from dirax.numerics.tolerances import EQUATION_RANK, RANK_GAP, RANK_ROUNDOFF, STRUCTURE_RANK, TINY
 from dirax.numerics.transversals import transversal_scales
 
@@ -66,6 +68,10 @@ SMALL = 8
 20 µs."""
 
 
+ALONE = 64
+"""Rows from which on BLAS would have several threads invert a matrix."""
+
+
 def surely_independent(entries: Sequence[float], k: int, most: float = SURE) -> bool:
     """Whether the rows of a matrix (k, l), which someone has scaled, its entries row by row, are independent beyond doubt: the
     product of its norm and that of a right inverse, which is no less than its condition number, is below `most`. False also where
@@ -119,7 +125,8 @@ def _inverse_norm(entries: Sequence[float], k: int) -> float:
         return (a * a + b * b + c * c + d * d) / determinant / determinant if determinant else math.inf
     if k > SMALL:
         try:
-            inverse = np.linalg.inv(np.array(entries).reshape(k, k))
+            with one_thread() if k > ALONE else nullcontext():
+                inverse = np.linalg.inv(np.array(entries).reshape(k, k))
         except np.linalg.LinAlgError:
             return math.inf
         return float(np.vdot(inverse, inverse))
