@@ -121,3 +121,14 @@ def test_roots_side_by_side_and_their_derivatives(count):
     slopes = -(roots[0] ** 3) / (1.0 + 3.0 * a[:, None] * roots[0] ** 2)
     expected = np.sum(roots[0] ** 2) + np.sum(2.0 * roots[0] * slopes * a[:, None])
     assert float(value) == pytest.approx(float(expected), rel=1e-14)
+
+
+@pytest.mark.parametrize("scheme", [dx.Collocation(2), dx.DiscreteDirac()], ids=["collocation", "discrete Dirac"])
+def test_a_motion_whose_momentum_comes_to_have_no_velocity_ends_there(scheme):
+    """The momenta of √(1 + ξ·Iξ) are bounded, gravity drives one out of them, and the root goes to infinity."""
+    body = dx.EulerPoincare(dx.SO3(), lambda xi, a: jnp.sqrt(1.0 + xi @ (INERTIA * xi)) - 5.0 * a[2], advected=3)
+    start = body.state([0.3, 0.3, 0.2], [0.8, 0.0, 0.6])
+    sol = dx.simulate(body.lie_poisson(), scheme, x=start, step=0.05, steps=40, engine="native")
+    assert not sol.ok and sol.rows < 12
+    assert sol.stats["max_residual"] < 1e-10
+    assert np.all(np.abs(sol.x) < 2.0)

@@ -37,7 +37,7 @@ from dirax.engines.policy import LARGEST_NATIVE
 from dirax.engines.step_program import step_program
 from dirax.engines.steps_in_numbers import StepsInNumbers
 from dirax.numerics.equilibration import power_of_two
-from dirax.numerics.tolerances import TINY
+from dirax.numerics.tolerances import EPSILON, TINY
 from dirax.program.compiled import compiled
 from dirax.program.graph import GraphTooLarge
 from dirax.program.interpreter import UnsupportedPrimitive
@@ -80,13 +80,24 @@ def grown(problem: Problem, lanes: np.ndarray, completed: np.ndarray, state: np.
 
     Data may be so special where a run begins that an unknown has no size there. Sizes are those at the solution of the next step:
     at a guess that is far from it they may be anything, and what is far from solved would count as roundoff. Everything has an
-    axis of the `lanes`."""
+    axis of the `lanes`.
+
+    A solution of which roundoff leaves no digit, as where a root inside of the step goes to infinity, is none: with its sizes
+    everything would count as roundoff."""
     guess, good = _next_step(problem, lanes, completed, state, guess)
     if not np.any(good):
         return sizes, good
     found = sizes_there(problem, lanes, completed, state, guess)
+    good &= _is_known(guess, found)
     more = np.any([np.any(new > old, axis=1) for new, old in zip(found, sizes, strict=True)], axis=0)
     return tuple(np.maximum(new, old) for new, old in zip(found, sizes, strict=True)), more & good
+
+
+def _is_known(unknowns: tuple, sizes: Sizes) -> np.ndarray:
+    """Where some unknown is larger than its roundoff, or all are zero."""
+    larger = [np.any(np.abs(u) > EPSILON * a, axis=1) for u, a in zip(unknowns, sizes, strict=True)]
+    zero = [np.all(np.asarray(u) == 0.0, axis=1) for u in unknowns]
+    return np.any(larger, axis=0) | np.all(zero, axis=0)
 
 
 def _next_step(p: Problem, lanes: np.ndarray, completed: np.ndarray, state: np.ndarray, guess: tuple) -> tuple[tuple, Any]:
