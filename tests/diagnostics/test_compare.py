@@ -58,3 +58,17 @@ def test_what_cannot_be_compared_is_said():
         dx.convergence(system, dx.LagrangeDAlembert(), step_sizes=[0.1, 0.05, 0.025], time=1.0, save_every=2, **one)
     with pytest.raises(ValueError, match=r"dx\.convergence compares steps that are given"):
         dx.convergence(system, dx.LagrangeDAlembert(), step_sizes=[0.1, 0.05, 0.025], time=1.0, tolerance=1e-3, **one)
+
+
+@pytest.mark.parametrize("measure", ["compare", "convergence"])
+def test_ctrl_c_in_one_run_ends_the_measurement(measure):
+    def interrupt(done, total):
+        raise KeyboardInterrupt
+
+    kepler = gallery.get("kepler")
+    run = {"params": kepler.params, "progress": interrupt, **kepler.initial}
+    with pytest.raises(KeyboardInterrupt):
+        if measure == "compare":
+            dx.compare(kepler.system, [dx.LagrangeDAlembert()], step=0.05, steps=200_000, **run)
+        else:
+            dx.convergence(kepler.system, dx.LagrangeDAlembert(), step_sizes=[0.05, 0.025, 0.0125], time=2000.0, **run)

@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dirax.diagnostics.bench.subject import Skipped
-from dirax.diagnostics.convergence import convergence, refuse_tolerance
+from dirax.diagnostics.convergence import convergence, refuse_tolerance, simulated
 from dirax.diagnostics.drift import judge
 from dirax.diagnostics.energy_lines import energy_less_work, energy_scale
 from dirax.diagnostics.explicit_solution import ExplicitSolution, explicit_solution
 from dirax.numerics.arrays import is_whole
 from dirax.numerics.tolerances import EPSILON
 from dirax.program.user_functions import refuse_traced
-from dirax.run.simulate import simulate
 from dirax.schemes.step import AbstractScheme
 from dirax.solution.solution import Solution
 from dirax.solution.style import COLOURS, MARKERS, given_or_new, style
@@ -136,14 +135,14 @@ def compare(
         raise ValueError("schemes must name at least one scheme, but it is empty.")
     if not is_whole(repeats) or repeats < 1:
         raise ValueError(f"repeats must be a whole number ≥ 1, but {repeats!r:.80} was given.")
-    sols = {name: simulate(system, scheme, step=step, steps=steps, **run) for name, scheme in named.items()}
+    sols = {name: simulated(system, scheme, step=step, steps=steps, **run) for name, scheme in named.items()}
     if batches := [sol.batch for sol in sols.values() if sol.batch is not None]:
         raise ValueError(f"dx.compare compares one trajectory, but a batch of {batches[0]} was given: give the data of one.")
     seconds = {name: [] for name in named}
     for _ in range(repeats):
         for name, scheme in named.items():
             tick = clock.perf_counter()
-            sol = simulate(system, scheme, step=step, steps=steps, **run)
+            sol = simulated(system, scheme, step=step, steps=steps, **run)
             seconds[name].append(sol.stats.get("run_seconds", clock.perf_counter() - tick))
     label = "its own" if reference is None else "the reference that was given"
     if reference is None:

@@ -9,6 +9,7 @@ import numpy as np
 from dirax.diagnostics.bench.subject import Skipped
 from dirax.diagnostics.explicit_solution import ExplicitSolution, explicit_solution
 from dirax.program.user_functions import refuse_traced
+from dirax.run.failure_messages import INTERRUPTED
 from dirax.run.simulate import simulate
 from dirax.schemes.step import AbstractScheme
 from dirax.solution.solution import Solution
@@ -285,8 +286,16 @@ def _checked(step_sizes, time: float) -> np.ndarray:
     return h
 
 
+def simulated(system: AbstractSystem, scheme: AbstractScheme, **run: Any) -> Solution:
+    """`dx.simulate`, of which Ctrl-C ends the whole measurement and not one run of it alone."""
+    sol = simulate(system, scheme, **run)
+    if any(message.startswith(INTERRUPTED) for message in ([sol.message] if isinstance(sol.message, str) else sol.message)):
+        raise KeyboardInterrupt
+    return sol
+
+
 def _run(system, scheme, h: float, time: float, every: int, run: Mapping[str, Any]) -> Solution:
-    sol = simulate(system, scheme, step=h, steps=round(time / h), save_every=every, **run)
+    sol = simulated(system, scheme, step=h, steps=round(time / h), save_every=every, **run)
     if not np.all(sol.ok):
         message = sol.message if isinstance(sol.message, str) else next(m for m in sol.message if m)
         raise ValueError(f"the run with steps of {h:g} failed, so no order can be measured: {message}")

@@ -32,6 +32,9 @@ NEARLY = 1e-9
 BOUNDLESS = 1e12
 """Changes by rounding, relative to the unknowns, that are those of a state which has grown beyond all bounds."""
 
+INTERRUPTED = "interrupted by the user"
+"""How the message of a run begins that Ctrl-C has ended."""
+
 brief: ContextVar[bool] = ContextVar("brief", default=False)
 """Whether the failed step is not computed again to see where it breaks: of a million trajectories many may fail."""
 
@@ -48,7 +51,7 @@ def explain(problem: Problem, outcome: Outcome, lane: int, kept: int, sizes: Cal
         time_of = lambda steps: reached if steps == completed else np.nan
     rows = f"kept up to step {p.first_step + kept}" + f" (t = {time_of(kept):.6g})" * bool(np.isfinite(time_of(kept)))
     if int(outcome.status[lane]) == OK:
-        return f"interrupted by the user; {rows}."
+        return f"{INTERRUPTED}; {rows}."
     at = time_of(completed)
     reason = _by_status(outcome, lane) if brief.get() else _reason(p, outcome, lane, at, sizes) + _remark(p, outcome, lane, at)
     if kept == completed and outcome.unsaid is not None and outcome.unsaid[lane]:
