@@ -314,3 +314,13 @@ def test_code_of_a_module_without_a_name_is_the_users():
     space["Of"].k = 4.0
     with pytest.raises(ValueError, match=r"reads Of\.k"):
         end(space["system"])
+
+
+def test_a_change_that_a_function_in_a_function_sees_is_told_as_its_own():
+    scope = {"jnp": jnp, "J": jnp.array([1.0, 2.0, 3.0])}
+    body = dx.EulerPoincare(dx.SO3(), eval("lambda xi: xi @ (J * xi) / 2 + (xi @ xi) ** 2 / 10", scope))
+    run = lambda: dx.simulate(body.lie_poisson(), dx.Collocation(1), x=[0.1, 0.5, 0.3], step=0.05, steps=2)
+    run()
+    scope["J"] = jnp.array([3.0, 2.0, 1.0])
+    with pytest.raises(ValueError, match=r"^lagrangian reads J, which was"):
+        run()

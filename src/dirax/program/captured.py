@@ -207,11 +207,15 @@ def _attributes(function: types.FunctionType, seen: set[int]) -> frozenset[str]:
     return found
 
 
+class ReadsChanged(ValueError):
+    """A function reads what is no longer what it was when it was stated."""
+
+
 def refuse_changed(captured: Iterable[tuple[str, Captured]]) -> None:
-    """Raise `ValueError` where functions (their name, what they read) would run with values that are not those of now."""
+    """Raise `ReadsChanged` where functions (their name, what they read) would run with values that are not those of now."""
     for name, each in captured:
         if words := each.changed():
-            raise ValueError(
+            raise ReadsChanged(
                 f"{name} reads {words}; what was traced of it keeps the old value: state it again for the new one, or hand the "
                 "value over in params."
             )

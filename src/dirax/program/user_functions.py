@@ -16,7 +16,7 @@ import numpy as np
 from jax.core import Tracer
 from jax.experimental import checkify
 
-from dirax.program.captured import Captured, refuse_changed
+from dirax.program.captured import Captured, ReadsChanged, refuse_changed
 from dirax.program.compiled import compiled
 from dirax.program.derivatives_by_jax import differentiated
 from dirax.program.hoisted import hoisted, split
@@ -158,6 +158,8 @@ class UserFunction(eqx.Module):
         least, else None."""
         try:
             jaxpr, out = jax.make_jaxpr(lambda *v: self(*v), return_shape=True)(*values)
+        except ReadsChanged:  # of a function that this one calls
+            raise
         except Exception as error:
             why = why_untraced(error, values[-1] if self.takes_params else None)
             raise TypeError(f"{self._call} could not be traced by JAX{self._on(values)}: {why}") from error
