@@ -101,9 +101,11 @@ class LiftedStep:
         )
 
     def start(self, data, h, params):
+        """The state and the unknowns where a run begins, the roots found at them."""
         return self._begun(self.stage.start, data, h, params)
 
     def resume(self, data, h, params):
+        """The same where a run goes on."""
         return self._begun(self.stage.resume, data, h, params)
 
     def _begun(self, begin: Callable, data, h, params):
@@ -112,16 +114,20 @@ class LiftedStep:
         return state, jnp.concatenate([u, *map(jnp.ravel, roots)])
 
     def guess(self, state, previous, h, params):
+        """The guess of the step, with the roots of the step before."""
         (u,) = self._of(self._guess, previous, state, 0.0, h, params)
         return jnp.concatenate([u, previous[self.stage.unknowns :]])
 
     def residual(self, u, state, t, h, params):
+        """What vanishes: the equations of the step, then those of the roots."""
         return jnp.concatenate(self._of(self._residual, u, state, t, h, params))
 
     def advance(self, u, state, t, h, params):
+        """The state after the step."""
         return self._of(self._advance, u, state, t, h, params)[0]
 
     def unpack(self, state, u, t, h, params):
+        """The fields of a row."""
         return dict(zip(sorted(self.stage.fields), self._of(self._rows, u, state, t, h, params), strict=True))
 
     def _of(self, part: Part, unknowns, state, t, h, params) -> list:
