@@ -132,3 +132,13 @@ def test_a_motion_whose_momentum_comes_to_have_no_velocity_ends_there(scheme):
     assert not sol.ok and sol.rows < 12
     assert sol.stats["max_residual"] < 1e-10
     assert np.all(np.abs(sol.x) < 2.0)
+
+
+@pytest.mark.parametrize("flux", [-5e-4, -5e-3])
+def test_a_root_that_is_not_there_at_the_guess_of_a_long_step(flux):
+    """A guess that leads a coil beyond what a diode lets back; x by shorter steps is the same up to their error."""
+    circuit = dx.circuit([("L", 1, 0, 1.0), ("R", 1, 0, DIODE), ("C", 2, 0, 1.0), ("R", 2, 0, 1.0)])
+    scheme = dx.VariableSteps(dx.DiscreteDirac(), density=lambda x: 1.0 + x @ x)
+    sol = dx.simulate(circuit, scheme, x=[0.1, flux], step=0.05, steps=40)
+    assert sol.ok and sol.stats["engine"] == "native"
+    assert sol.x[:, 0] == pytest.approx(0.1 * np.exp(-sol.t), rel=1e-3)

@@ -30,6 +30,9 @@ GUESS, RESIDUAL, ADVANCE, ROWS = range(4)
 PREVIOUS = 2
 """The number of the operand of it that the residual does not have: the unknowns of the step before."""
 
+SHORT = 2.0**-10
+"""Part of a step that hardly moves."""
+
 _lifted: Memo[StepEquation | StepSequence] = Memo(128)
 
 
@@ -110,7 +113,8 @@ class LiftedStep:
 
     def _begun(self, begin: Callable, data, h, params):
         state, u = begin(data, h, params)
-        roots = self.inside.roots(self._step(u, state, data.get("t", 0.0), h, params))
+        # a long step by the guess may lead to where there is no root, as behind a diode
+        roots = self.inside.roots(self._step(u, state, data.get("t", 0.0), SHORT * h, params))
         return state, jnp.concatenate([u, *map(jnp.ravel, roots)])
 
     def guess(self, state, previous, h, params):
