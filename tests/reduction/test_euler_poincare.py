@@ -242,3 +242,15 @@ def test_what_is_reconstructed_is_verified():
         line = reconstruction(whole, None)
         whole.fields[field] = right
         assert line.verdict == "VIOLATED" and f"{field} at t = 0.3 (trajectory 1)" in line.explanation
+
+
+@pytest.mark.parametrize("scale", [1e-9, 1.0, 1e9])
+def test_a_momentum_that_no_velocity_has_has_no_energy(scale):
+    """l = s √(1 + ξ·Iξ) has −s √(1 − μ·I⁻¹μ/s²) for its energy, and momenta with μ·I⁻¹μ < s² alone."""
+    body = dx.EulerPoincare(dx.SO3(), lambda xi: scale * jnp.sqrt(1.0 + xi @ (jnp.array([1.0, 2.0, 3.0]) * xi)))
+    energy = lambda mu: float(body.energy_at({"x": scale * jnp.array(mu), "t": 0.0}, None))
+    assert energy([0.5, 0.3, 0.4]) == pytest.approx(-scale * np.sqrt(1.0 - 0.25 - 0.045 - 0.16 / 3.0), rel=1e-14)
+    assert energy([0.0, 0.0, 0.0]) == -scale
+    assert np.isnan(energy([1.5, 0.3, 0.4]))
+    with pytest.raises(ValueError, match="outside the domain"):
+        dx.simulate(body.lie_poisson(), dx.Collocation(2), x=scale * np.array([1.5, 0.3, 0.4]), step=0.1, steps=3)

@@ -28,9 +28,9 @@ FAR = 1e3
 """A zero at this distance, relative to 1 + |start|, is none near the start."""
 
 
-def damped_step(change: Any, update: Callable, u: Any, units: Any, sizes: Any, xp: ModuleType = np) -> tuple[Any, Any]:
-    """(u, whether to go on) after a Newton step that is halved until the next one would be shorter: so neither the units of the
-    equations nor those of the unknowns matter, and the domain of the equations is not left.
+def damped_step(change: Any, update: Callable, u: Any, units: Any, sizes: Any, xp: ModuleType = np) -> tuple[Any, Any, Any]:
+    """(u, whether to go on, whether the step is near zero) after a Newton step that is halved until the next one would be
+    shorter: so neither the units of the equations nor those of the unknowns matter, and the domain of the equations is not left.
 
     `update(u)` (…, k) is A⁻¹ r(u), with one A for all u, and `change` its value at the given u; `units` (…, k) are what steps are
     measured in, and `sizes` (…, k) how large the unknowns are: steps that are NEAR zero in both go on until neither of them
@@ -62,7 +62,8 @@ def damped_step(change: Any, update: Callable, u: Any, units: Any, sizes: Any, x
 
     with np.errstate(all="ignore"):  # begun at twice the step, so that XLA compiles `improves` once
         fraction, better = _repeated(xp, lambda carry: xp.any(unfinished(carry)), halve, (xp.full(here.shape, 2.0), at_floor))
-        return xp.where(better[..., None], u - xp.minimum(fraction, 1.0)[..., None] * change, u), better & ~at_floor
+        u = xp.where(better[..., None], u - xp.minimum(fraction, 1.0)[..., None] * change, u)
+        return u, better & ~at_floor, near | at_floor
 
 
 def sizes_of_unknowns(matrix: Any, inverse: Any, u: Any, residual: Any, xp: ModuleType = np) -> Any:

@@ -21,23 +21,24 @@ from dirax.program.primitives import binds, plain_primitive
 from dirax.program.tracing import closed_over, jacobian
 
 
-def nearest_root(residual: Callable, guess: Float[Array, " k"], max_steps: int = 100) -> Float[Array, " k"]:
+def nearest_root(residual: Callable, guess: Float[Array, " k"], max_steps: int = 100, strict: bool = False) -> Float[Array, " k"]:
     """A root of `residual` (k,) → (k,) near `guess`; where it has several, that of the least changes from the guess.
 
     A step is halved until the next one would be shorter, so that the units of the equations and of the unknowns do not
     matter and the domain of `residual` is not left. Where there is no root, the last point that was an improvement comes
-    back, so check the residual if that can happen. Differentiable any number of times, by the implicit function theorem.
+    back, so check the residual if that can happen; `strict`: NaN where steps do not become small there. Differentiable any
+    number of times, by the implicit function theorem.
     """
     guess = jnp.asarray(guess)
     if binds(guess):
         closed, captured, result = closed_over(residual, [guess])
         if all(jnp.result_type(x) == jnp.float64 for x in (result, *captured)):
-            return root_p.bind(*captured, guess, residual=closed, max_steps=max_steps, axes=())[0]
+            return root_p.bind(*captured, guess, residual=closed, max_steps=max_steps, strict=strict, axes=())[0]
     residual, captured = jax.closure_convert(residual, guess)
-    return _root(jax.jit(residual), max_steps, guess, *captured)
+    return _root(jax.jit(residual), max_steps, strict, guess, *captured)
 
 
-def _root(residual: Callable, max_steps: int, guess, *captured):
+def _root(residual: Callable, max_steps: int, strict: bool, guess, *captured):
     """The root for a residual of the unknowns and of what it captured."""
     fixed = lax.stop_gradient(captured)
     of_unknowns = lambda u: residual(u, *fixed)
@@ -46,14 +47,16 @@ def _root(residual: Callable, max_steps: int, guess, *captured):
     inverse_at = _least_changes(of_unknowns) if sparse is None else _by_elimination(of_unknowns, sparse)
 
     def step(carry):
-        u, _, count = carry
+        u, _, _, count = carry
         value = of_unknowns(u)
         inverse, units, sizes = inverse_at(u, value)
-        u, going = damped_step(inverse(value), lambda u: inverse(of_unknowns(u)), u, units, sizes, jnp)
-        return u, going, count + 1
+        u, going, near = damped_step(inverse(value), lambda u: inverse(of_unknowns(u)), u, units, sizes, jnp)
+        return u, near, going, count + 1
 
-    unfinished = lambda carry: carry[1] & (carry[2] < max_steps)
-    root = lax.while_loop(unfinished, step, (lax.stop_gradient(guess), jnp.array(True), 0))[0]
+    unfinished = lambda carry: carry[2] & (carry[3] < max_steps)
+    begun = lax.stop_gradient(guess), jnp.array(False), jnp.array(True), 0
+    root, near, *_ = lax.while_loop(unfinished, step, begun)
+    root = jnp.where(near, root, jnp.nan) if strict else root
     if sparse is not None:
         return sparse.root(lambda u: residual(u, *captured), root)
     return implicit(lambda u, captured: residual(u, *captured), root, captured, least_change)
@@ -147,20 +150,20 @@ def _unknowns_first(residual: ClosedJaxpr) -> Callable:
     return lambda u, *captured: jaxpr_as_fun(residual)(*captured, u)[0]
 
 
-def _by_jax(*operands, residual: ClosedJaxpr, max_steps: int, axes: Axes):
-    one = lambda *operands: _root(_unknowns_first(residual), max_steps, operands[-1], *operands[:-1])
+def _by_jax(*operands, residual: ClosedJaxpr, max_steps: int, strict: bool, axes: Axes):
+    one = lambda *operands: _root(_unknowns_first(residual), max_steps, strict, operands[-1], *operands[:-1])
     return [over(one, axes)(*operands)]
 
 
-def _shapes(*operands, residual: ClosedJaxpr, max_steps: int, axes: Axes):
+def _shapes(*operands, residual: ClosedJaxpr, axes: Axes, **_):
     (one,) = residual.out_avals
     return [ShapedArray((*lead_of(operands, axes), *one.shape), one.dtype)]
 
 
-def _root_p_tangents(primals, tangents, *, residual: ClosedJaxpr, max_steps: int, axes: Axes):
+def _root_p_tangents(primals, tangents, *, residual: ClosedJaxpr, axes: Axes, **options):
     if residual.out_avals[0].shape[0] >= FEWEST_SPARSE:
-        return _as_plain(primals, tangents, residual=residual, max_steps=max_steps, axes=axes)
-    u = root_p.bind(*primals, residual=residual, max_steps=max_steps, axes=axes)[0]
+        return _as_plain(primals, tangents, residual=residual, axes=axes, **options)
+    u = root_p.bind(*primals, residual=residual, axes=axes, **options)[0]
     moves, count = [not isinstance(t, ad.Zero) for t in tangents[:-1]], len(primals) - 1
 
     def one(u, *given):

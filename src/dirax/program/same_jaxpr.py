@@ -65,7 +65,7 @@ def value_key(value: Any) -> Any:
     if isinstance(value, Jaxpr):
         return _equations(value)
     if isinstance(value, dict):
-        return tuple([(name, value_key(one)) for name, one in value.items()])
+        return tuple([(name, value_key(value[name])) for name in sorted(value)])
     if isinstance(value, tuple | list):
         return tuple([value_key(one) for one in value])
     return _constant(value) if isinstance(value, np.ndarray | float) else (type(value), value)

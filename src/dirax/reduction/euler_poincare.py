@@ -94,11 +94,11 @@ class EulerPoincare(AbstractSystem):
 
     def inverse_legendre(self, momentum: Algebra, a: Advected, params: Any = None, guess: Algebra | None = None) -> Algebra:
         """The ξ with ∂l/∂ξ = μ, of several one near `guess` (zero by default); of an l that is quadratic in ξ by linear
-        equations."""
+        equations. NaN where there is none."""
         of_xi = lambda xi: self.value(xi, a, params)
         if moves(jax.hessian(of_xi), momentum):
             begin = jnp.zeros_like(momentum) if guess is None else guess
-            return nearest_root(lambda xi: self.legendre(xi, a, params) - momentum, begin)
+            return nearest_root(lambda xi: self.legendre(xi, a, params) - momentum, begin, strict=True)
         return constrained_velocity(of_xi, momentum, jnp.zeros((0, len(momentum))), jnp.zeros(0), momentum)[0]
 
     def constraint_forms(self, a: Advected, params: Any = None) -> Float[Array, "m d"]:

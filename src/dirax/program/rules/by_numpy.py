@@ -279,7 +279,7 @@ def root(made: ScalarProgram, interpreter: Interpreter, equation: Any, *operands
 
     def find(arrays: list[np.ndarray]) -> list[np.ndarray]:
         *captured, found = arrays
-        found, going, at = found.copy(), np.arange(len(found)), begun()
+        found, going, at, near = found.copy(), np.arange(len(found)), begun(), np.zeros(len(found), bool)
         for _ in range(equation.params["max_steps"]):
             if not len(going):
                 break
@@ -287,8 +287,10 @@ def root(made: ScalarProgram, interpreter: Interpreter, equation: Any, *operands
             value = residual([*known, found[going]])[0]
             inverse, units, sizes = at(going, known, found[going], value)
             update = lambda u, known=known, inverse=inverse: inverse(residual([*known, u])[0])
-            found[going], more = damped_step(inverse(value), update, found[going], units, sizes)
+            found[going], more, near[going] = damped_step(inverse(value), update, found[going], units, sizes)
             going = going[more]
+        if equation.params["strict"]:
+            found[~near] = np.nan
         return [found]
 
     axes, (result,) = equation.params["axes"], [v.aval.shape for v in equation.outvars]
