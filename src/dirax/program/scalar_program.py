@@ -64,11 +64,12 @@ class ScalarProgram:
     _asked: int = 0
 
     @classmethod
-    def of(cls, jaxpr: ClosedJaxpr, by_numpy: bool = False, for_few: bool = False) -> "ScalarProgram":
-        """The program of a jaxpr, `by_numpy` with decompositions, roots and loops that are no expressions.
+    def of(cls, jaxpr: ClosedJaxpr, by_numpy: bool = False, for_few: bool = False, limit: int = NODE_LIMIT) -> "ScalarProgram":
+        """The program of a jaxpr, `by_numpy` with decompositions, roots and loops that are no expressions, else of up to `limit`
+        nodes.
 
         Raises `UnsupportedPrimitive` and `GraphTooLarge`."""
-        made = cls(Graph(IN_NUMPY if by_numpy else NODE_LIMIT), [], for_few=for_few)
+        made = cls(Graph(IN_NUMPY if by_numpy else limit), [], for_few=for_few)
         made.inputs = [made.fresh(v.aval.shape) for v in jaxpr.jaxpr.invars]
         made.run(jaxpr, {name: functools.partial(rule, made) for name, rule in NUMPY_RULES.items()} if by_numpy else {})
         return made

@@ -49,9 +49,13 @@ class Noise:
             return np.equal(x, y)
         return np.abs(x - y) <= ALIKE * self.size * np.maximum(np.abs(x), np.abs(y))
 
+    def draw(self, shape: tuple[int, ...]) -> np.ndarray:
+        """Numbers at random, from 0 to 1."""
+        return self._draw.random(shape)
+
     def off(self, values: Any) -> Any:
         """Numbers as they would be if they had been rounded."""
-        return values * (1.0 + self.size * (2.0 * self._draw.random(np.shape(values)) - 1.0))
+        return values * (1.0 + self.size * (2.0 * self.draw(np.shape(values)) - 1.0))
 
     def _off(self, function: Callable) -> Callable:
         return lambda *operands: self.off(function(*operands))

@@ -21,7 +21,7 @@ from dirax.program.linear_solves import equilibrated_inverse, pseudo_inverses
 from dirax.program.memo import Memo, Same
 from dirax.program.rules.linear_algebra import linear_equations, split_as
 from dirax.program.rules.reductions import factors_of_product, sum_of_products, terms_of_product, zeros_of
-from dirax.program.scalar_program import ScalarProgram, numpy_rule
+from dirax.program.scalar_program import IN_NUMPY, ScalarProgram, numpy_rule
 from dirax.program.tracing import jacobian, of_one_result
 
 LARGE_DERIVATIVE = 30_000
@@ -88,7 +88,7 @@ _inner: Memo[ScalarProgram | None] = Memo(128)
 
 def _plain(jaxpr: ClosedJaxpr) -> ScalarProgram | None:
     try:
-        return ScalarProgram.of(jaxpr)
+        return ScalarProgram.of(jaxpr, limit=IN_NUMPY)
     except (UnsupportedPrimitive, GraphTooLarge):
         return None
 
