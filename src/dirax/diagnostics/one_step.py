@@ -50,11 +50,11 @@ def differentiated_steps(
 
 
 def _by_jax(same: Same, h: Any, state, guesses, t, blur, params):
-    step = differentiated_step(same.object, h, state, guesses, t, blur, params)
+    step = differentiated_step(same.object, h, state, guesses, t, params, blur)
     return jnp.concatenate([step.state, step.jacobian.ravel(), step.condition[None]])
 
 
-def differentiated_step(equation: Any, h: Any, state, guesses, t, blur, params) -> DifferentiatedStep:
+def differentiated_step(equation: Any, h: Any, state, guesses, t, params, blur=(0.0, 0.0)) -> DifferentiatedStep:
     """One step solved by the engine's Newton method from a guess for each part, differentiated by the implicit function theorem;
     NaN where it fails. `blur`: by how much entries of Jacobians are off, and the number in [0, 1) that decides by how much each.
 
