@@ -216,3 +216,10 @@ def test_impulses_of_composed_steps_have_the_order_of_the_composition():
     run = {"q": q, "v": v - along * (along @ v) / (along @ along), "step_sizes": [0.1, 0.05, 0.025], "time": 1.0}
     found = dx.convergence(system, dx.Composition(dx.LagrangeDAlembert(), "suzuki4"), **run)
     assert abs(found.slopes["multipliers"].order - 4.0) < 0.05, str(found)
+
+
+def test_equations_with_a_root_in_them_are_solved_explicitly_too():
+    body = dx.EulerPoincare(dx.SO3(), lambda xi: jnp.sqrt(1.0 + xi @ (jnp.array([1.0, 2.0, 3.0]) * xi))).lie_poisson()
+    found = dx.convergence(body, dx.DiscreteDirac(), x=[0.5, 0.3, 0.4], time=1.0, step_sizes=[0.2, 0.1, 0.05])
+    assert found.reference == "the explicit equations of motion"
+    assert found.orders["x"] == pytest.approx(2.0, abs=0.05)

@@ -5,6 +5,7 @@ integrated by Gragg's midpoint rule with extrapolation in h² (Hairer, Nørsett,
 """
 
 import functools
+import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -33,6 +34,9 @@ MOST_EVALUATIONS = 3_000_000
 
 FIRST_EVALUATIONS = 20_000
 """After so many it is foreseen how many the whole takes."""
+
+MOST_BY_JAX = 200_000
+"""The same where XLA evaluates it."""
 
 GIVEN = ("q", "v", "p", "x")
 
@@ -64,7 +68,10 @@ class ExplicitSolution:
             from dirax.diagnostics.bench.ode_solvers import compiled_field  # imported when it is used
         except ImportError:
             raise Skipped("needs llvmlite") from None
-        return compiled_field(self.ode)
+        try:
+            return compiled_field(self.ode)
+        except Skipped:  # a root in it, or a decomposition
+            return _field_by_jax(self.ode)
 
     def _solved(self, t: np.ndarray) -> dict[str, np.ndarray]:
         y = extrapolated(self._field, self.t0, self.ode.start, t)
@@ -76,6 +83,18 @@ class ExplicitSolution:
             p = in_numpy(momentum, rows, (Same(self), "p"))
             return {"q": y[:, :n], "p": np.asarray(jax.vmap(momentum)(*rows)) if p is None else p}
         return {"q": y} if isinstance(self.system, PhaseSpaceLagrangian) else {"x": y[:, :n]}
+
+
+def _field_by_jax(ode: ExplicitODE) -> Callable[[float, np.ndarray], np.ndarray]:
+    """(t, y) ↦ ẏ compiled by XLA, each evaluation of which takes some 20 µs. Raises `Skipped` after MOST_BY_JAX of them."""
+    derivative, evaluations = jax.jit(ode.derivative), itertools.count()
+
+    def field(t: float, y: np.ndarray) -> np.ndarray:
+        if next(evaluations) > MOST_BY_JAX:
+            raise Skipped(f"they take more than {MOST_BY_JAX} evaluations")
+        return np.asarray(derivative(t, y))
+
+    return field
 
 
 def explicit_solution(system: AbstractSystem, run: Mapping[str, Any]) -> ExplicitSolution:

@@ -3,7 +3,7 @@
 A step may ask for the root of equations of its own: the velocity of a momentum, the voltages of a circuit, the point that a map
 leads to. As a loop within the loop of Newton's method it has no scalar program. Here the root becomes unknowns of the step, what
 it is the root of becomes equations, and Newton's method takes all of them at once (the lifted Newton method: Albersmeyer and
-Diehl, SIAM J. Optim. 20 (2010)). The first guess is the root itself at the guess of the step, later that of the step before.
+Diehl, SIAM J. Optim. 20 (2010)). The first guess is the root itself where the step begins, later that of the step before.
 """
 
 import dataclasses
@@ -62,9 +62,10 @@ def _of_stage(stage: StepEquation, p: Parameters) -> StepEquation:
         inside = LiftedJaxpr(closed)
     except Unliftable:
         return stage
+    if stage.unknowns + inside.size > LARGEST_NATIVE:
+        return stage
     step = LiftedStep(stage, p, inside)
-    few = stage.unknowns + inside.size <= LARGEST_NATIVE
-    return step.equation() if few and not step.looks_back and inside.are_regular else stage
+    return stage if step.looks_back or not inside.are_regular else step.equation()
 
 
 class LiftedStep:
