@@ -20,10 +20,7 @@ from dirax.program.memo import Memo, Same, by_value
 from dirax.program.roots import least_change_p, root_p
 from dirax.program.same_jaxpr import value_key
 from dirax.program.scalar_program import ScalarProgram
-from dirax.program.tracing import alone, jacobian, of_one_result
-
-CALLS = ("jit", "pjit", "closed_call")
-"""Primitives that do no more than their jaxpr says."""
+from dirax.program.tracing import CALLS, alone, jacobian, of_one_result
 
 SIDE_BY_SIDE = 64
 """Roots of one kind whose equations are written one after the other, with derivatives that stay one equation each."""

@@ -12,12 +12,10 @@ from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
 
 from dirax.program.roots import least_change, root_p
 from dirax.program.same_jaxpr import shared
-from dirax.program.tracing import all_plain, alone, directional_p, jacobian, of_one_result
+from dirax.program.tracing import CALLS, all_plain, alone, directional_p, jacobian, of_one_result
 
 Moved = list[tuple[Any, Any]]
 """Values, each with its tangent, None where it stands still."""
-
-CALLS = ("jit", "pjit", "closed_call")
 
 
 def pushed_forward(jaxpr: ClosedJaxpr, moves: tuple[bool, ...]) -> ClosedJaxpr:

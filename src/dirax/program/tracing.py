@@ -17,6 +17,9 @@ from dirax.program.same_jaxpr import shared
 KEPT = 512
 """Traced functions kept in memory."""
 
+CALLS = ("jit", "pjit", "closed_call")
+"""Primitives that do no more than their jaxpr says."""
+
 PLAIN = frozenset(
     (
         *("add", "sub", "mul", "div", "neg", "integer_pow", "pow", "square", "sqrt", "rsqrt", "cbrt", "exp", "exp2", "expm1"),
@@ -24,7 +27,7 @@ PLAIN = frozenset(
         *("lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not", "is_finite", "convert_element_type", "copy", "reshape"),
         *("squeeze", "expand_dims", "broadcast_in_dim", "transpose", "rev", "concatenate", "stack", "unstack", "tile", "split"),
         *("slice", "pad", "iota", "gather", "dynamic_slice", "dynamic_update_slice", "scatter", "scatter-add", "reduce_sum"),
-        *("dot_general", "add_any", "jit", "pjit", "closed_call", "floor", "ceil", "round", "sign"),
+        *("dot_general", "add_any", *CALLS, "floor", "ceil", "round", "sign"),
         *("dirax_derivative", "dirax_directional", "dirax_pullback", "dirax_formula", "dirax_program"),
     )
 )

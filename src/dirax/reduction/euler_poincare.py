@@ -261,6 +261,16 @@ class EulerPoincare(AbstractSystem):
         return self.constraint_forms(a, params) @ self.inverse_legendre(momentum, a, params, row.get("about"))
 
     @property
+    def stepped_by(self) -> str:
+        """dx.DiscreteEulerPoincare, and without constraints more."""
+        if self.one_forms is not None:
+            return "With constraints, dx.EulerPoincare systems are stepped by dx.DiscreteEulerPoincare."
+        return (
+            "dx.EulerPoincare systems are stepped by dx.DiscreteEulerPoincare and dx.EnergyCollocation, and the same motion, as "
+            "that of system.lie_poisson(), by schemes of points x such as dx.Collocation and dx.DiscreteDirac."
+        )
+
+    @property
     def projected(self) -> str:
         return "the momentum by the forces of the constraint"
 
