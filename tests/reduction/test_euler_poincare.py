@@ -258,5 +258,6 @@ def test_a_momentum_that_no_velocity_has_has_no_energy(scale):
 
 def test_schemes_that_do_not_step_it_name_the_way_out():
     body = dx.EulerPoincare(dx.SO3(), lambda xi: 0.5 * xi @ (jnp.array([1.0, 2.0, 3.0]) * xi))
-    with pytest.raises(TypeError, match=r"system\.lie_poisson\(\)"):
-        dx.simulate(body, dx.DiscreteGradient(), x=[0.5, 0.3, 0.4], step=0.1, steps=3)
+    for scheme in (dx.Collocation(2), dx.DiscreteDirac(), dx.DiscreteGradient()):
+        with pytest.raises(TypeError, match=r"system\.lie_poisson\(\)"):
+            dx.simulate(body, scheme, x=[0.5, 0.3, 0.4], step=0.1, steps=3)

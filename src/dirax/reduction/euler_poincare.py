@@ -266,8 +266,8 @@ class EulerPoincare(AbstractSystem):
         if self.one_forms is not None:
             return "With constraints, dx.EulerPoincare systems are stepped by dx.DiscreteEulerPoincare."
         return (
-            "dx.EulerPoincare systems are stepped by dx.DiscreteEulerPoincare and dx.EnergyCollocation, and the same motion, as "
-            "that of system.lie_poisson(), by schemes of points x such as dx.Collocation and dx.DiscreteDirac."
+            "dx.EulerPoincare systems are stepped by dx.DiscreteEulerPoincare and energy-preserving collocation; most other "
+            "schemes step the same motion as that of system.lie_poisson()."
         )
 
     @property
