@@ -43,14 +43,18 @@ def lifted(equation: Any, params: Any, batch_params: bool) -> Any:
         p = parameters(params, batch_params)
     except UnsupportedPrimitive:
         return equation
-    first = [k for k in first_of_each(equation.stages) if has_roots(step_jaxpr(equation.stages[k][0], p).jaxpr)]
-    return _lifted.get((Same(equation), p.key), lambda: _made(equation, p)) if first else equation
+    stages = (equation.stages[k][0] for k in first_of_each(equation.stages))
+    if not any(has_roots(step_jaxpr(stage, p).jaxpr) for stage in stages):
+        return equation
+    return _lifted.get((Same(equation), p.key), lambda: _made(equation, p))
 
 
 def _made(equation: Any, p: Parameters) -> Any:
     if isinstance(equation, StepEquation):
         return _of_stage(equation, p)
     made = {id(equation.stages[k][0]): _of_stage(equation.stages[k][0], p) for k in first_of_each(equation.stages)}
+    if all(made[id(stage)] is stage for stage, _ in equation.stages):
+        return equation
     return StepSequence(tuple((made[id(stage)], fraction) for stage, fraction in equation.stages))
 
 
@@ -136,11 +140,8 @@ class LiftedStep:
         return dict(zip(sorted(self.stage.fields), self._of(self._rows, u, state, t, h, params), strict=True))
 
     def _of(self, part: Part, unknowns, state, t, h, params) -> list:
-        roots, at = [], self.stage.unknowns
-        for kind in self.inside.kinds:
-            roots.append(jnp.reshape(unknowns[at : at + kind.size], kind.shape))
-            at += kind.size
-        return part([*roots, *self._step(unknowns[: self.stage.unknowns], state, t, h, params)])
+        first = self.stage.unknowns
+        return part([*self.inside.split(unknowns[first:]), *self._step(unknowns[:first], state, t, h, params)])
 
     def _step(self, u, state, t, h, params) -> list:
         """The operands of the jaxpr of the step; the unknowns are those before as well."""

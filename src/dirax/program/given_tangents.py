@@ -88,15 +88,21 @@ def _by_jax(*operands, value: Callable, tangent: Callable, axes: Axes) -> Array:
 
 def _tangents(primals: Sequence, tangents: Sequence, *, value: Callable, tangent: Callable, axes: Axes):
     result = given_p.bind(*primals, value=value, tangent=tangent, axes=axes)
+    return result, tangent_over(tangent, result, primals, tangents, axes)
+
+
+def tangent_over(tangent: Callable[..., Array], result: Array, operands: Sequence, tangents: Sequence, axes: Axes) -> Array:
+    """`tangent(result, operands, along)` as `with_tangent` has it, under the `jax.vmap`s of the operands, for the tangents that
+    JAX hands to a rule."""
     moves = [not isinstance(t, ad.Zero) and getattr(t, "dtype", None) != float0 for t in tangents]
-    count = len(primals)
+    count = len(operands)
 
     def one(result, *given):
         along = iter(given[count:])
         return tangent(result, given[:count], [next(along) if moved else None for moved in moves])
 
     levels = tuple((0, *level, *(a for a, moved in zip(level, moves, strict=True) if moved)) for level in axes)
-    return result, over(one, levels)(result, *primals, *(t for t, moved in zip(tangents, moves, strict=True) if moved))
+    return over(one, levels)(result, *operands, *(t for t, moved in zip(tangents, moves, strict=True) if moved))
 
 
 def lead_of(operands: Sequence, axes: Axes) -> tuple[int, ...]:

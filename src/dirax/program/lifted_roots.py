@@ -75,26 +75,28 @@ class LiftedJaxpr:
         """The roots, found."""
         return jaxpr_as_fun(self.of_operands)(*operands)
 
+    def split(self, numbers: Any) -> list:
+        """The roots of which these are the numbers (size,), in order."""
+        found, at = [], 0
+        for kind in self.kinds:
+            found.append(jnp.reshape(numbers[at : at + kind.size], kind.shape))
+            at += kind.size
+        return found
+
     @property
     def are_regular(self) -> bool:
         """Whether the equations of the roots determine them, at one of some places chosen at random that is in their domain; so
         they are said to be where none is, and where they have no scalar program."""
         defect = self.part(self.results)
-        shapes = [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in self._all.in_avals]
-
-        def of_roots(numbers: Any, *operands: Any) -> Any:
-            ends = np.cumsum([a.size for a in self.kinds])[:-1]
-            roots = [jnp.reshape(one, a.shape) for one, a in zip(jnp.split(numbers, ends), self.kinds, strict=True)]
-            return defect([*roots, *operands])[0]
-
+        given = [ShapedArray((self.size,), np.dtype(float)), *self.of_operands.in_avals]
+        of_roots = lambda numbers, *operands: defect([*self.split(numbers), *operands])[0]
         try:
-            numbers = jax.ShapeDtypeStruct((self.size,), np.float64)
-            slope = ScalarProgram.of(jax.make_jaxpr(jacobian(of_roots))(numbers, *shapes[len(self.kinds) :]), by_numpy=True)
+            slope = ScalarProgram.of(jax.make_jaxpr(jacobian(of_roots))(*given), by_numpy=True)
         except (UnsupportedPrimitive, GraphTooLarge):
             return True
         random = np.random.default_rng(0).uniform
         with np.errstate(all="ignore"):
-            (matrices,) = slope.in_numpy([random(*NEAR, (PLACES, *a.shape)) for a in [numbers, *shapes[len(self.kinds) :]]])
+            (matrices,) = slope.in_numpy([random(*NEAR, (PLACES, *a.shape)) for a in given])
         finite = matrices[np.all(np.isfinite(matrices), axis=(1, 2))]
         return not len(finite) or int(np.max(rank_of_equations(finite)[0])) == self.size
 

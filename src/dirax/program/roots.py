@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from dirax.numerics.newton import damped_step, sizes_of_unknowns
 from dirax.numerics.sparse import FEWEST_SPARSE
 from dirax.numerics.tolerances import TINY
-from dirax.program.given_tangents import Axes, implicit, implicit_tangent, lead_of, over, stays_one
+from dirax.program.given_tangents import Axes, implicit, implicit_tangent, lead_of, over, stays_one, tangent_over
 from dirax.program.linear_solves import equilibrated_inverse, scaled_pseudo_inverse
 from dirax.program.primitives import binds, plain_primitive
 from dirax.program.tracing import closed_over, jacobian
@@ -164,16 +164,8 @@ def _root_p_tangents(primals, tangents, *, residual: ClosedJaxpr, axes: Axes, **
     if residual.out_avals[0].shape[0] >= FEWEST_SPARSE:
         return _as_plain(primals, tangents, residual=residual, axes=axes, **options)
     u = root_p.bind(*primals, residual=residual, axes=axes, **options)[0]
-    moves, count = [not isinstance(t, ad.Zero) for t in tangents[:-1]], len(primals) - 1
-
-    def one(u, *given):
-        along = iter(given[count:])
-        directions = [next(along) if moved else None for moved in moves]
-        return implicit_tangent(_unknowns_first(residual), u, given[:count], directions, least_change)
-
-    levels = tuple((0, *level[:-1], *(a for a, moved in zip(level, moves, strict=False) if moved)) for level in axes)
-    along = (t for t, moved in zip(tangents, moves, strict=False) if moved)
-    return [u], [over(one, levels)(u, *primals[:-1], *along)]
+    one = lambda u, captured, along: implicit_tangent(_unknowns_first(residual), u, captured, along, least_change)
+    return [u], [tangent_over(one, u, primals[:-1], tangents[:-1], tuple(level[:-1] for level in axes))]
 
 
 root_p = plain_primitive("dirax_root", _by_jax, _shapes)

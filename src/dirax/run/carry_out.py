@@ -27,7 +27,7 @@ from dirax.run.final_manifold import (
 )
 from dirax.run.own_equation import refuse_wrong_shapes, shape_of
 from dirax.run.plan import AnyPlan, planned
-from dirax.run.premises import check_premise
+from dirax.run.premises import bytes_of, check_premise
 from dirax.run.progress import reported, reporting
 from dirax.run.redundancy import redundant_constraints, without_redundant
 from dirax.run.refused_start import SHORTER, refuse_bad_start
@@ -81,7 +81,7 @@ def _numbers(case: Case) -> Hashable:
     finds in a small part of their steps."""
     if case.batch is not None or max([a.size for a in case.data.values()]) > LARGEST_START:
         return None
-    return *[a.tobytes() for a in case.data.values()], *[leaf.tobytes() for leaf in case.leaves], case.h, case.t0
+    return *[a.tobytes() for a in case.data.values()], *bytes_of(case.params), case.h, case.t0
 
 
 _kinds: Memo[Kind] = Memo(128)
