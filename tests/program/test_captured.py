@@ -5,6 +5,8 @@ import functools
 import pickle
 import types
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
@@ -324,3 +326,33 @@ def test_a_change_that_a_function_in_a_function_sees_is_told_as_its_own():
     scope["J"] = jnp.array([3.0, 2.0, 1.0])
     with pytest.raises(ValueError, match=r"^lagrangian reads J, which was"):
         run()
+
+
+WRAPPED = {
+    "jit": jax.jit,
+    "grad": jax.grad,
+    "jit of hessian": lambda f: jax.jit(jax.hessian(f)),
+    "checkpoint": jax.checkpoint,
+    "custom_jvp": jax.custom_jvp,
+    "equinox": eqx.filter_grad,
+    "vectorize": jnp.vectorize,
+}
+
+
+@pytest.mark.parametrize("wrapped", WRAPPED.values(), ids=WRAPPED)
+def test_functions_that_a_library_wraps_are_looked_into(wrapped):
+    own = {"k": 1.0}
+    potential = wrapped(lambda q: own["k"] * q @ q / 2)
+    captured = Captured(lambda q, v: v @ v / 2 - potential(q))
+    assert not captured.changed()
+    own["k"] = 4.0
+    assert captured.changed() == "own['k'], which was 1.0 when it was stated and is 4.0 now"
+
+
+def test_rules_of_derivatives_are_looked_into():
+    own = {"k": 1.0}
+    potential = jax.custom_jvp(lambda q: q @ q / 2)
+    potential.defjvp(lambda primals, tangents: (potential(*primals), own["k"] * primals[0] @ tangents[0]))
+    captured = Captured(lambda q, v: v @ v / 2 - potential(q))
+    own["k"] = 4.0
+    assert captured.changed().startswith("own['k'], which was 1.0")

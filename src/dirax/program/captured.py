@@ -24,6 +24,7 @@ from dirax.program.outside_values import (
     LIBRARIES,
     NOT_OF_VALUES,
     attribute,
+    beside_inner,
     contents,
     inner,
     is_installed,
@@ -119,10 +120,11 @@ class Captured:
             self._follow(value.__func__, words, names, depth + 1)
             own = getattr(value.__func__, "__code__", None)
             self._follow(value.__self__, words or "self", names | reads(own).others if own else names, depth + 1)
+        elif (function := inner(value)) is not value:
+            for part in (function, *beside_inner(value)):
+                self._follow(part, words, names, depth)
         elif isinstance(value, types.FunctionType):
             self._follow_function(value, depth)
-        elif (function := inner(value)) is not value:
-            self._follow(function, words, names, depth)
         elif isinstance(value, Mapping):
             keys = lambda: [*itertools.islice(value, MOST)]
             self.watched.append(Watched(f"the keys of {words}", keys, keys()))

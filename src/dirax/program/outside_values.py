@@ -71,16 +71,23 @@ def with_methods(value: Any, names: frozenset[str]) -> frozenset[str]:
 
 
 def inner(value: Any) -> Any:
-    """The function that a property, a class method or what `functools.cache` makes of one stands for; else the value itself."""
+    """The function that a property, a class method or what a library makes of one, as `functools.cache`, `jax.jit` and `jax.grad`
+    do, stands for; else the value itself."""
     if isinstance(value, property):
         return value.fget
     if isinstance(value, functools.cached_property):
         return value.func
     if isinstance(value, classmethod | staticmethod | types.MethodType):
         return value.__func__
-    if isinstance(value, functools._lru_cache_wrapper):
-        return value.__wrapped__
+    if callable(value) and not isinstance(value, type) and package_of_code(value) in LIBRARIES:
+        wrapped = getattr(value, "__wrapped__", value)
+        return value if wrapped is value else inner(wrapped)
     return value
+
+
+def beside_inner(value: Any) -> list[types.FunctionType]:
+    """The functions of a user that a library's object holds besides the one that it stands for, as rules of derivatives."""
+    return [part for part in getattr(value, "__dict__", {}).values() if isinstance(part, types.FunctionType)]
 
 
 def contents(cell: types.CellType) -> Any:
@@ -104,9 +111,15 @@ def is_installed(kind: type) -> bool:
 
 
 def package_of(function: Any) -> str:
-    """The package that a function, or the class of an object that is called, is written in."""
+    """The package that a function, or the class of an object that is called, is written in, as it says."""
     of_kind = "" if isinstance(function, types.FunctionType) else type(function).__module__
     return (getattr(function, "__module__", None) or of_kind or "").partition(".")[0]
+
+
+def package_of_code(function: Any) -> str:
+    """The package whose code is called: where a library wraps a function of someone else, it says that it is from there."""
+    of_globals = function.__globals__.get("__name__") if isinstance(function, types.FunctionType) else type(function).__module__
+    return (of_globals or "").partition(".")[0]
 
 
 def root_of(value: Any) -> str:
