@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dirax.engines import policy
 from dirax.engines.contract import Outcome, Problem, Progress
 from dirax.engines.engine import AbstractEngine
+from dirax.engines.step_program import FULL, step_program
 from dirax.engines.walk import AbstractWalk, WalkByRuns
 from dirax.engines.xla import Xla
 from dirax.program.interpreter import UnsupportedPrimitive
@@ -84,14 +85,15 @@ class Auto(AbstractEngine):
         """The sparse engine or the xla engine, and why not the former. Raises `ValueError` for dense steps that are too large."""
         if problem.size < policy.FEWEST_SPARSE:
             return Xla(), {}
-        try:
-            sparse = policy.engine_of("sparse", only_quicker=True)
-            reason = sparse.supports(problem)
-        except ImportError as error:
-            reason = str(error)
-        else:
-            if reason is None:
-                return sparse, {}
+        if (reason := _full(problem)) is None:
+            try:
+                sparse = policy.engine_of("sparse", only_quicker=True)
+                reason = sparse.supports(problem)
+            except ImportError as error:
+                reason = str(error)
+            else:
+                if reason is None:
+                    return sparse, {}
         unknowns = max(stage.unknowns for stage, _ in problem.equation.stages)
         if unknowns > policy.LARGEST_DENSE:
             raise ValueError(
@@ -101,3 +103,17 @@ class Auto(AbstractEngine):
                 'engine="xla".'
             )
         return Xla(), {"not_sparse": reason}
+
+
+def _full(p: Problem) -> str | None:
+    """Why a step of moderate size is not sparse, which its scalar program says at once; None where it does not."""
+    unknowns = max(stage.unknowns for stage, _ in p.equation.stages)
+    if p.size > policy.LARGEST_NATIVE:
+        return None
+    try:
+        full = step_program(p.equation, p.params, p.batch_params).full
+    except UnsupportedPrimitive:
+        return None
+    if 2 * full <= unknowns:
+        return None
+    return f"{full} equations of {unknowns} need each other's unknowns, in more than one entry of {FULL} of their matrix"

@@ -12,6 +12,7 @@ from jax.extend.core import ClosedJaxpr, jaxprs_in_params
 
 import dirax.program.rules  # noqa: F401  (registers the rules)
 from dirax.engines import policy
+from dirax.engines.blocks import blocks
 from dirax.engines.parameters import Parameters, parameters
 from dirax.engines.step_jaxpr import step_jaxpr
 from dirax.program.equal_nodes import without_equals
@@ -34,6 +35,12 @@ KEPT = 128
 
 IN_NUMBERS = 2**22
 """Derivatives of nodes up to which a Jacobian is found in numbers, which is quicker once than to write it as nodes."""
+
+SWEPT = 30_000
+"""Products of derivatives from which on it takes a second to write a Jacobian as nodes, and one in numbers is found by sweeps."""
+
+FULL = 3
+"""A block of a Jacobian is full of which one entry in so many may differ from zero."""
 
 WRITTEN = 50_000
 """Unknowns times nodes of a step up to which its Jacobian is written as nodes for one entry in floats."""
@@ -216,6 +223,23 @@ class StepProgram:
             return error.with_traceback(None)
         kept = [[{j: next(entries) for j in row} for row in rows] for rows in found]
         return [[{j: node for j, node in row.items() if node != self.graph.zero} for row in rows] for rows in kept]
+
+    @cached_property
+    def is_swept(self) -> bool:
+        """Whether Jacobians are found in numbers by sweeps over the graph, where they would be too many nodes."""
+        return max(self.graph.products(e.residual, e.unknowns) for e in self.equations) > SWEPT
+
+    @cached_property
+    def full(self) -> int:
+        """Rows of the largest of the blocks that Jacobians are eliminated by, of those that are full; 0 for none."""
+        there = [self.graph.dependence(e.residual, e.unknowns) for e in self.equations]
+        each = [(len(rows), one[np.ix_(rows, columns)]) for one in there if one.size for rows, columns in blocks(one)]
+        return max((size for size, block in each if FULL * np.sum(block) > block.size), default=0)
+
+    @property
+    def least_operations(self) -> int:
+        """Those that the elimination of such a block takes at least, that of a symmetric matrix."""
+        return self.full**3 // 6
 
     @cached_property
     def entries(self) -> int:

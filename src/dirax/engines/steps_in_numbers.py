@@ -82,9 +82,15 @@ class StepsInNumbers:
     _depends: list[set[int]] = field(init=False)
     _reads: ReadAgain = field(init=False)
     _slopes: dict[tuple[int, ...], Slopes] = field(init=False, default_factory=dict)
+    _sweeps: list[Slopes] | None = field(init=False)
+    """How the Jacobians are found in numbers; None where they are nodes."""
 
     def __post_init__(self):
-        _ = self.program.jacobians  # with which the graph has all its nodes
+        self._sweeps = None
+        if self.program.is_swept:
+            self._sweeps = [Slopes(self.program.graph, e.residual, e.unknowns) for e in self.program.equations]
+        else:
+            _ = self.program.jacobians  # with which the graph has all its nodes
         self._reads = ReadAgain(self.program.graph)
         self._depends = [self._moving(e.unknowns) for e in self.program.equations]
 
@@ -110,8 +116,11 @@ class StepsInNumbers:
     def operations(self, states: int = 1, call: int = 1) -> int:
         """About how many scalar operations a step of so many states takes: its functions a few times, and a matrix or two
         inverted. A function takes as long as of `call` states, at least."""
-        unknowns = [len(self.program.equations[index].unknowns) for index, _ in self.program.stages]
-        return 4 * sum(max(states, call) * len(self.program.graph) + states * k**3 for k in unknowns)
+        total, nodes = 0, len(self.program.graph)
+        for index, _ in self.program.stages:
+            k, swept = len(self.program.equations[index].unknowns), self._sweeps[index].size if self._sweeps else 0
+            total += max(states, call) * nodes + states * (k**3 + k * swept)
+        return 4 * total
 
     def parameters(self, params: Any, batch: int | None, lanes: np.ndarray) -> np.ndarray:
         """The numbers of `params` of these trajectories, (states, numbers); `batch` is None for params that all of them share."""
@@ -432,7 +441,11 @@ class StepsInNumbers:
 
     def _linearized(self, index: int, known: Values) -> tuple[np.ndarray, np.ndarray]:
         """The Jacobians (states, k, k) of a residual, and the residuals."""
-        rows, residual = self.program.jacobians[index], self.program.equations[index].residual
+        e = self.program.equations[index]
+        if self._sweeps is not None:
+            slopes = known.slopes(e.residual, e.unknowns, self._sweeps[index])
+            return slopes, known.read(_nodes(e.residual))
+        rows, residual = self.program.jacobians[index], e.residual
         places = [(i, j, node) for i, row in enumerate(rows) for j, node in row.items()]
         found = self._read(known, [*(node for _, _, node in places), *residual], index)
         out = np.zeros((known.entries, len(rows), len(rows)))

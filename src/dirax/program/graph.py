@@ -342,13 +342,22 @@ class Graph:
 
     def dependence(self, outputs: Sequence[int], inputs: Sequence[int]) -> np.ndarray:
         """Which of the outputs need which of the inputs, (outputs, inputs)."""
-        needs = {node: 1 << j for j, node in enumerate(inputs)}
-        for node in self.reachable(outputs, set(needs)):
-            needs[node] = functools.reduce(operator.or_, [needs[a] for a in self.args[node]], 0)
-        size = -(-len(inputs) // 8)
+        needs, size = self._needs(outputs, inputs), -(-len(inputs) // 8)
         table = b"".join(needs[node].to_bytes(size, "little") for node in outputs)
         bits = np.unpackbits(np.frombuffer(table, np.uint8), bitorder="little").reshape(len(outputs), 8 * size)
         return bits[:, : len(inputs)].astype(bool)
+
+    def products(self, outputs: Sequence[int], inputs: Sequence[int]) -> int:
+        """How many products the derivatives of the outputs by the inputs are sums of, node by node."""
+        needs = self._needs(outputs, inputs)
+        return sum([needs[a].bit_count() for node in needs for a in self.args[node] if a in needs])
+
+    def _needs(self, outputs: Sequence[int], inputs: Sequence[int]) -> dict[int, int]:
+        """The inputs that each node on the way to the outputs needs, one bit each."""
+        needs = {node: 1 << j for j, node in enumerate(inputs)}
+        for node in self.reachable(outputs, set(needs)):
+            needs[node] = functools.reduce(operator.or_, [needs[a] for a in self.args[node]], 0)
+        return needs
 
     def replaced(self, outputs: Sequence[int], others: dict[int, int]) -> list[int]:
         """The outputs with other nodes in place of some."""

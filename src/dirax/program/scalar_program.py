@@ -87,9 +87,13 @@ class ScalarProgram:
         return np.array([self.graph.input(f"x{first + i}") for i in range(math.prod(shape))], np.int64).reshape(shape)
 
     def depends_on(self, inputs: Nodes) -> bool:
-        """Whether a result needs one of these inputs by operations of the graph."""
-        needed = self.graph.reachable([node for nodes in self.results for node in nodes.ravel().tolist()])
-        return not set(inputs.ravel().tolist()).isdisjoint(needed)
+        """Whether a result needs one of these inputs."""
+        flat = lambda arrays: [node for nodes in arrays for node in nodes.ravel().tolist()]
+        needed = set(self.graph.reachable(flat(self.results)))
+        for step in reversed(self.opaque):
+            if not needed.isdisjoint(flat(step.results)):
+                needed.update(self.graph.reachable(flat(step.operands)))
+        return not needed.isdisjoint(flat([inputs]))
 
     def between(self, operands: list[Nodes], shapes: list[tuple[int, ...]], function: Callable, name: Any = None) -> list[Nodes]:
         """The nodes of the results of an opaque computation: of one with an equal `name` and the same operands those there are,

@@ -32,10 +32,10 @@ class Native(AbstractEngine):
             made = kernels(problem.equation, problem.params, problem.batch_params, problem.compensated)
             if self.most_operations is not None:
                 most = max(self.most_operations, int(policy.SCALARS_FOR_ARRAYS * made.step.array_operations))
-                written = made.without_corrections
+                written = made.without_corrections + made.step.least_operations
                 written = written if written > most else made.written
                 if written > most:
-                    return f"{written} scalar operations to be written out, more than {most}"
+                    return f"at least {written} scalar operations to be written out, more than {most}"
         except UnsupportedPrimitive as error:
             return str(error)
         return None

@@ -126,6 +126,17 @@ class Slopes:
         self.needed = [*nodes, *(factor for _, terms in self.terms for _, factor in terms or ())]
         self.order = Order(graph.reachable(self.needed))
 
+    @property
+    def size(self) -> int:
+        """Products for each of the inputs, or of the nodes."""
+        return sum(len(terms or (0, 0)) for _, terms in self.terms)
+
+    @property
+    def factors(self) -> list[int]:
+        """The nodes that the derivatives are made of, with the conditions of selections."""
+        conditions = [self.graph.args[node][0] for node, terms in self.terms if terms is None]
+        return [*self.needed[len(self.nodes) :], *conditions]
+
     @functools.cached_property
     def tape(self) -> RowTape | None:
         """The derivatives by a compiled loop; None for few nodes, and where nothing compiles it."""

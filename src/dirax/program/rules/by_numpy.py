@@ -16,7 +16,7 @@ from dirax.numerics.tolerances import EQUATION_RANK, TINY
 from dirax.program.evaluation.in_numpy import LANES, Slopes, Values, in_parts
 from dirax.program.given_tangents import Axes
 from dirax.program.graph import GraphTooLarge
-from dirax.program.interpreter import RULES, Interpreter, Nodes, Unavailable, Unsupported, UnsupportedPrimitive
+from dirax.program.interpreter import RULES, Interpreter, Nodes, Unavailable, Unsupported, UnsupportedPrimitive, elementwise
 from dirax.program.linear_solves import equilibrated_inverse, pseudo_inverses
 from dirax.program.memo import Memo, Same
 from dirax.program.rules.linear_algebra import linear_equations, split_as
@@ -60,30 +60,44 @@ def dot_general(made: ScalarProgram, interpreter: Interpreter, equation: Any, a:
 
 @numpy_rule("dirax_derivative")
 def derivative_in_numbers(made: ScalarProgram, interpreter: Interpreter, equation: Any, *operands: Nodes) -> list[Nodes]:
-    """Derivatives of large functions by many numbers are found in numbers, with no graph of their own."""
+    """Derivatives of large functions by many numbers are found in numbers, with no graph of their own; constant ones at once."""
     jaxpr, wanted = equation.params["jaxpr"], equation.params["wanted"]
     inner = _inner.get(Same(jaxpr), lambda: _plain(jaxpr))
     large = LARGE_FOR_FEW if made.for_few else LARGE_DERIVATIVE
     if inner is None or len(inner.graph) * sum(operands[k].size for k in wanted) < large:
         return list(RULES["dirax_derivative"](interpreter, equation, *operands))
-    (result,), inputs = inner.results, [node for k in wanted for node in inner.inputs[k].ravel().tolist()]
-    outputs, plans = result.ravel().tolist(), []
-    there = inner.graph.dependence(outputs, inputs)
-
-    def slopes(arrays: list[np.ndarray]) -> list[np.ndarray]:
-        plans[:] = plans or [Slopes(inner.graph, outputs, inputs)]
-        known = Values(inner.graph, len(arrays[0]))
-        for nodes, array in zip(inner.inputs, arrays, strict=True):
-            known.bind(nodes, array)
-        return [known.slopes(outputs, inputs, plans[0])[:, there]]
-
-    whole = np.full(there.shape, made.graph.zero)
-    whole[there] = made.between(list(operands), [(int(there.sum()),)], slopes)[0]
+    found = _in_numbers.get((Same(jaxpr), wanted), lambda: _InNumbers(inner, wanted))
+    whole = np.full(found.there.shape, made.graph.zero)
+    if found.constant is not None:
+        whole[found.there] = elementwise(made.graph.constant, found.constant)
+    else:
+        whole[found.there] = made.between([operands[k] for k in found.given], [(int(found.there.sum()),)], found.slopes)[0]
     parts = np.split(whole, np.cumsum([operands[k].size for k in wanted])[:-1], axis=1)
     return [part.reshape(v.aval.shape) for part, v in zip(parts, equation.outvars, strict=True)]
 
 
+class _InNumbers:
+    """The derivative of the result of a program by some of its inputs: which entries can differ from zero, which inputs they are
+    made of, and what they are where they are made of none."""
+
+    def __init__(self, inner: ScalarProgram, wanted: tuple[int, ...]):
+        self.inner, (result,) = inner, inner.results
+        outputs, inputs = result.ravel().tolist(), [node for k in wanted for node in inner.inputs[k].ravel().tolist()]
+        self.there, self.plan = inner.graph.dependence(outputs, inputs), Slopes(inner.graph, outputs, inputs)
+        needed = set(inner.graph.reachable(self.plan.factors))
+        self.given = [k for k, nodes in enumerate(inner.inputs) if not needed.isdisjoint(nodes.ravel().tolist())]
+        self.constant = None if self.given else self.slopes([])[0][0]
+
+    def slopes(self, arrays: list[np.ndarray]) -> list[np.ndarray]:
+        """Those entries, (states, entries), by what is given of the inputs."""
+        known, given = Values(self.inner.graph, len(arrays[0]) if arrays else 1), dict(zip(self.given, arrays, strict=True))
+        for k, nodes in enumerate(self.inner.inputs):
+            known.bind(nodes, given[k] if k in given else np.zeros((known.entries, *nodes.shape)))
+        return [known.slopes(self.plan.nodes, self.plan.inputs, self.plan)[:, self.there]]
+
+
 _inner: Memo[ScalarProgram | None] = Memo(128)
+_in_numbers: Memo[_InNumbers] = Memo(128)
 
 
 def _plain(jaxpr: ClosedJaxpr) -> ScalarProgram | None:
@@ -222,18 +236,27 @@ def _with_slope(residual: ClosedJaxpr) -> tuple[Callable, Callable[[], At], int]
     if (sparse := _sparse(slope)) is not None:
         return value, lambda: _by_elimination(*sparse), LANES
     linear = ScalarProgram.of(slope, by_numpy=True)
-    fixed = not linear.opaque and linear.inputs[-1].size > 0 and not linear.depends_on(linear.inputs[-1])
-    return value, lambda: _least_changes(linear.in_numpy, fixed), LANES if fixed else _together(linear.results[0].size)
+    if not any(map(linear.depends_on, linear.inputs)):
+        at = _least_changes(linear.in_numpy, CONSTANT)
+        return value, lambda: at, LANES
+    fixed = FIXED if not linear.depends_on(linear.inputs[-1]) else MOVING
+    return value, lambda: _least_changes(linear.in_numpy, fixed), _together(linear.results[0].size)
 
 
-def _least_changes(linear: Callable, fixed: bool) -> At:
-    """By pseudo-inverses of the derivatives, which are `fixed` where they are surely the same whatever the unknowns are."""
+CONSTANT, FIXED, MOVING = "constant", "fixed", "moving"
+"""Derivatives that are surely the same for all entries, the same whatever the unknowns of an entry are, and others."""
+
+
+def _least_changes(linear: Callable, kind: str) -> At:
+    """By pseudo-inverses of the derivatives, which are found once unless they move with the unknowns."""
     known_of_all: list[np.ndarray] = []
 
     def at(entries, captured, u, value):
-        if not (fixed and known_of_all):
-            known_of_all[:] = [slope := linear([*captured, u])[0], *_inverted(slope)]
-        slope, inverse, units = (a[entries] for a in known_of_all) if fixed else known_of_all
+        if kind == MOVING or not known_of_all:
+            arrays = [*captured, u]
+            slope = linear([a[:1] for a in arrays] if kind == CONSTANT else arrays)[0]
+            known_of_all[:] = slope, *_inverted(slope)
+        slope, inverse, units = (a[entries] for a in known_of_all) if kind == FIXED else known_of_all
         return lambda right: (inverse @ right[..., None])[..., 0], units, sizes_of_unknowns(slope, inverse, u, value)
 
     return at
