@@ -637,6 +637,20 @@ def test_steps_across_a_jump_of_the_lagrangian_are_told(where):
     assert told == (where in JUMPS), line
 
 
+def test_a_late_clock_is_no_jump():
+    """At t = 10⁹ the last place of the time is 10⁻⁷, in which the energy changes by far more than its roundoff."""
+    system = dx.LagrangeDirac(lambda t, q, v: v @ v / 2 - q @ q / 2 * (1 + 0.1 * jnp.sin(t)))
+    sol = dx.simulate(system, dx.LagrangeDAlembert(), q=[1.0], v=[0.5], step=0.1, steps=100, t0=1e9)
+    assert "VIOLATED" not in {line.verdict for line in dx.verify(sol).lines}
+
+
+def test_numpy_that_raises_does_not_matter():
+    rod = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[1], holonomic=lambda q: (q @ q - 1)[None])
+    with np.errstate(all="raise"):
+        sol = dx.simulate(rod, dx.DiscreteDirac(constraints="resolve"), q=[0.6, -0.8], v=[0.8, 0.6], step=0.05, steps=5)
+        assert sol.ok and "VIOLATED" not in {line.verdict for line in dx.verify(sol).lines}
+
+
 def test_which_trajectories_of_a_batch_go_across_a_jump_is_told():
     sol = dx.simulate(
         dx.LagrangeDirac(STAIR), dx.LagrangeDAlembert(), q=[[0.6], [0.0], [0.7]], v=[[1.0], [1.0], [2.0]], step=0.02, steps=60

@@ -42,6 +42,16 @@ def test_free_systems(scheme, name):
     assert lifted.scheme.discrete_lagrangian == "left" and not isinstance(lifted.scheme, dx.DiscreteRouth)
 
 
+def test_a_part_begins_on_the_configuration_space():
+    sol = particle(dx.PlusLagrangeDirac(), steps=12)
+    part, whole = sol[4:12], dx.reconstruct(sol)
+    assert set(part.initial) == {"q", "p"} and "VIOLATED" not in verdicts(part).values()
+    np.testing.assert_array_equal(dx.reconstruct(part).q, whole.q[4:12])
+    np.testing.assert_array_equal(part.initial["p"], whole.p[4])
+    lost = sol.replace(scheme=None, equation=None)
+    assert "without its scheme" in dx.verify(lost)["steps replayed"].explanation
+
+
 def test_damage_is_seen():
     sol = particle(dx.PlusLagrangeDirac(), steps=20)
     sol.fields["mu"][12:] += 1e-9

@@ -1,5 +1,6 @@
 """Whether the energy has a jump between two rows: as the piece of the way from one to the other in which it changes shrinks, a
-jump keeps its size, and a kink, a stiff spring or a steep wall does not."""
+jump keeps its size, and a kink, a stiff spring or a steep wall does not. Where a last place of the time, or of another number,
+changes the energy as much as that, nothing is said."""
 
 import numpy as np
 
@@ -60,14 +61,15 @@ class _Ways:
         whole = {name: a if sol.batch is not None else np.asarray(a)[None] for name, a in sol.row_fields.items()}
         self.starts, self.ends = ({name: np.asarray(a)[lanes, rows + i] for name, a in whole.items()} for i in (0, 1))
 
-    def energy(self, s: np.ndarray, time: np.ndarray | None = None) -> np.ndarray:
-        """At the shares s (B, K, n) of the ways; the time may be that at other shares."""
+    def energy(self, s: np.ndarray, time: np.ndarray | None = None, off: bool = False) -> np.ndarray:
+        """At the shares s (B, K, n) of the ways; the time may be that at other shares; `off` by one last place of each number."""
         items = {}
         for name, start in self.starts.items():
             share = s if time is None or name not in ("t", CLOCK) else np.broadcast_to(time, s.shape)
             start, end = (a.reshape(*self.shape, 1, *a.shape[2:]) for a in (start, self.ends[name]))
             share = share.reshape(*s.shape, *(1,) * (start.ndim - 3))
             values = np.where(share < 0.5, start + share * (end - start), end - (1.0 - share) * (end - start))
+            values = np.nextafter(values, np.where(end == start, np.inf, end)) if off else values
             values = values.reshape(len(s), -1, *start.shape[3:])
             items[name] = values if self.sol.batch is not None else values[0]
         return over_rows(at_rows(self.sol, energy_at), self.sol, (items,)).reshape(s.shape)
@@ -97,7 +99,10 @@ class _Ways:
         keeps = (left > least) & (left > half / 2) & (left < 2 * half)
         middle = (low + width / 2)[..., None]
         beside = np.clip(middle + np.array([-BESIDE, BESIDE]), 0.0, 1.0)
-        found[:, which] = keeps & (_changes(self.energy(beside, middle))[..., 0] > left / 2)
+        there = self.energy(beside, middle)
+        with np.errstate(invalid="ignore"):
+            rough = np.max(np.nan_to_num(np.abs(self.energy(beside, middle, off=True) - there)), axis=-1)
+        found[:, which] = keeps & (_changes(there)[..., 0] > left / 2) & (rough < left / 4)
         return found
 
 

@@ -107,8 +107,8 @@ class Replay:
     @classmethod
     def of(cls, sol: Solution) -> "Replay":
         """Raises `CannotReplay`."""
-        if sol.system is None or sol.equation is None:
-            raise CannotReplay("the solution was loaded without its system")
+        if sol.lacks:
+            raise CannotReplay(sol.lacks)
         if lacking := sol.equation.fields.keys() - sol.fields.keys():
             raise CannotReplay(f"the rows hold no {', '.join(sorted(lacking))}: verify what this was reconstructed from")
         try:

@@ -36,14 +36,13 @@ LEFT_OUT = (
     "; only the constraints that were left out are missed: they follow from the others where all holonomic ones hold, and the "
     "rows of this scheme are off that"
 )
-WITHOUT_SYSTEM = "the solution was loaded without its system"
 WORDS = {2: "two", 3: "three"}
 
 
 def structure_of(sol: Solution) -> AbstractDiscreteStructure | str:
     """The discrete structure of a run, from its scheme; or why there is none."""
-    if sol.system is None or sol.scheme is None or not sol.initial:
-        return WITHOUT_SYSTEM
+    if sol.lacks:
+        return sol.lacks
     return sol.scheme.discrete_structure(sol.system, shape_of(sol), sol.step)
 
 
@@ -127,8 +126,8 @@ def symplecticity(sol: Solution, tolerance: float | None) -> Line:
     """The line of the form on the states whose change in one step is known."""
     constrained = any(info.place == "step" and name == "multipliers" for name, info in sol.field_info.items())
     name = "structural relation φ*Ω = Ω + dβ" if constrained else "symplecticity of one step"
-    if sol.equation is None or sol.system is None:
-        return Line(name, None, None, NOT_CHECKED, WITHOUT_SYSTEM)
+    if sol.lacks:
+        return Line(name, None, None, NOT_CHECKED, sol.lacks)
     if max(stage.state_size for stage, _ in sol.equation.stages) > LARGEST_STATE:
         return symplecticity_of_many(sol, name, tolerance)
     if "work" in sol.fields and not keeps_books(sol):

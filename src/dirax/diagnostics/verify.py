@@ -31,6 +31,7 @@ from dirax.solution.trajectory import last_rows
 
 @patience()
 @one_thread()
+@np.errstate(all="ignore")
 def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None = None) -> Report:
     """Measure the structure of a solution: a `Report` with one line a quantity, each with a tolerance and a verdict.
 

@@ -196,6 +196,7 @@ def _no_plan() -> None:
 
 @patience()
 @one_thread()
+@np.errstate(all="ignore")  # what is not finite is looked for and said, whatever a program has NumPy raise
 def _begun(settings: Settings, case: Case, steps: int, save_every: int, asked: int) -> Begun:
     """The general way from a case to its problem; `asked`: the `save_every` that was asked for."""
     system, scheme, by_jax = settings.system, settings.scheme, settings.engine.compiles_start(case.traced)

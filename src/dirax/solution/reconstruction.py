@@ -11,12 +11,12 @@ import numpy as np
 from dirax.geometry.group_retractions import coadjoint
 from dirax.geometry.lie_group import AbstractLieGroup
 from dirax.numerics.tolerances import GROUP_DEFECT
-from dirax.program.evaluation.functions import in_numpy
 from dirax.program.memo import by_value
 from dirax.program.user_functions import is_traced
 from dirax.schemes.lagrange_dirac import LagrangeDAlembert
 from dirax.schemes.routh import DiscreteRouth
 from dirax.schemes.step import Field
+from dirax.solution.each_row import each_row, plain
 from dirax.solution.events import Events
 from dirax.solution.loading import with_code
 from dirax.solution.solution import Solution
@@ -49,7 +49,7 @@ def reconstruct(solution: Solution, g0: Any = None) -> Solution:
     if g0 is not None:
         raise ValueError("g0 is for systems on a Lie group: here the initial data name the group coordinate already.")
     reduced = (*system.own_fields, "vertical")
-    of_rows = lambda fields, _: _each_row({name: fields[name] for name in system.own_fields}, system.unreduced_row)
+    of_rows = lambda fields, _: each_row({name: fields[name] for name in system.own_fields}, system.unreduced_row)
     lifted = of_rows(solution.fields, None)
     lifted |= {name: a for name, a in solution.fields.items() if name not in reduced}
     if system.system.one_forms is not None:
@@ -113,11 +113,11 @@ def _on_group(solution: Solution, group: AbstractLieGroup, d: int, g0: Any) -> S
     along = jax.vmap(rows, in_axes=(None, 0, 0))
     if solution.batch is not None:
         along = jax.vmap(along, in_axes=(0 if batched else None, 0, 0))
-    lifted = _plain(jax.jit(along)(start, jnp.asarray(solution.fields["g"]), jnp.asarray(solution.fields["x"])))
+    lifted = plain(jax.jit(along)(start, jnp.asarray(solution.fields["g"]), jnp.asarray(solution.fields["x"])))
 
     def of_events(fields, lanes):
         each = jax.vmap(rows, in_axes=(0 if batched else None, 0, 0))
-        return _plain(each(start[lanes] if batched else start, jnp.asarray(fields["g"]), jnp.asarray(fields["x"])))
+        return plain(each(start[lanes] if batched else start, jnp.asarray(fields["g"]), jnp.asarray(fields["x"])))
 
     kept = {name: a for name, a in solution.fields.items() if name != "g"}
     about = {
@@ -164,23 +164,6 @@ def _element(group: AbstractLieGroup, g0: Any, batch: int | None) -> jax.Array:
     if not is_traced(g) and not float(defect) < GROUP_DEFECT:
         raise ValueError(f"g0 is no element of {type(group).__name__}: it is off by {float(defect):.3g}.")
     return element
-
-
-def _each_row(rows: dict[str, Any], function: Callable) -> dict[str, Any]:
-    """`function(row)` of every row, in NumPy where it has a scalar program."""
-    names, lead = tuple(rows), np.shape(rows["x"])[:-1]
-    if not is_traced(rows) and math.prod(lead):
-        entries = [np.asarray(a).reshape(math.prod(lead), *np.shape(a)[len(lead) :]) for a in rows.values()]
-        found = in_numpy(lambda *values: function(dict(zip(names, values, strict=True))), entries, (function, names))
-        if found is not None:
-            return {name: a.reshape(*lead, *a.shape[1:]) for name, a in found.items()}
-    for _ in lead:
-        function = jax.vmap(function)
-    return _plain(function(rows))
-
-
-def _plain(fields: dict[str, Any]) -> dict[str, Any]:
-    return {name: np.asarray(a) if not is_traced(a) else a for name, a in fields.items()}
 
 
 def _lifted(

@@ -7,6 +7,7 @@ import jax
 import numpy as np
 
 from dirax.program.user_functions import is_traced
+from dirax.solution.each_row import each_row
 from dirax.solution.trajectory import ROWS_BEFORE, Some, Trajectory
 from dirax.text.representation import shortened
 
@@ -102,12 +103,18 @@ def rows_of(sol: Some, rows: range) -> Some:
     of_rows = lambda a: np.shape(a)[len(lead)] == sol.rows
     changes: dict[str, Any] = {"derived": {k: a[nodes if of_rows(a) else steps] for k, a in sol.derived.items()}}
     if rows.start > 0:
-        names = ("q", "p") if "q" in sol.fields else ("x",)
-        changes["initial"] = {k: sol.fields[k][(*lead, rows.start)] for k in names if k in sol.fields}
+        row = {k: a[(*lead, rows.start)] for k, a in sol.fields.items() if sol.field_info[k].place == "node"}
+        changes["initial"] = _data_at(row, None if sol.system is None else sol.system.quotient_form())
         changes["stats"] = sol.stats | {ROWS_BEFORE: sol.stats.get(ROWS_BEFORE, 0) + rows.start}
     part = sol.replace(t=sol.axis[rows.start : rows.stop], fields=fields, **changes)
     part.events, part.impacts = (_between_rows(sol, found, rows) for found in (sol.events, sol.impacts))
     return part
+
+
+def _data_at(row: dict[str, Any], quotient: Any) -> dict[str, Any]:
+    """The initial data of a run that begins at a row, those on Q for a system on the quotient of it."""
+    whole = row if quotient is None else each_row({name: row[name] for name in quotient.own_fields}, quotient.unreduced_row)
+    return {name: whole[name] for name in (("q", "p") if "q" in whole else ("x",)) if name in whole}
 
 
 def _between_rows(sol: Trajectory, found: Any, rows: range) -> Any:

@@ -144,6 +144,15 @@ class Trajectory:
         return copy
 
     @property
+    def lacks(self) -> str:
+        """What of the run's code a loaded solution is without, as part of a sentence; "" where it has its equation."""
+        if self.system is None:
+            return "the solution was loaded without its system, which dx.load(path, system=…) takes"
+        if self.scheme is None or self.equation is None:
+            return "the solution was loaded without its scheme, which dx.load(path, system=…, scheme=…) takes"
+        return ""
+
+    @property
     def t(self) -> Any:
         """The times of the rows, (rows,); of a batch whose steps have lengths of their own (B, rows)."""
         return self.fields.get(CLOCK, self.axis)
