@@ -178,6 +178,7 @@ def test_a_lagrangian_form_is_enough(method):
             lambda self, shape: dx.RelationForm(lambda x, v, u, t, params: [v, x]),
             r"6 numbers .* it returned a list",
         ),
+        ("energy_at", lambda self, row, params: row["x"], r"energy_at of Wrong must return one number, .* of shape \(6,\)"),
     ],
 )
 def test_methods_that_return_something_else_are_named(method, wrong, said):

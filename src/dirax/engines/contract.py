@@ -89,7 +89,7 @@ class Problem:
     def with_numbers(self, **numbers: Any) -> "Problem":
         """The same problem with other numbers, steps or rows; what was found of its equation is kept."""
         problem = object.__new__(Problem)
-        problem.__dict__.update(self.__dict__, **numbers)
+        object.__setattr__(problem, "__dict__", {**self.__dict__, **numbers})
         return problem
 
     @cached_property

@@ -120,7 +120,7 @@ class Begun:
     def with_numbers(self, **numbers: Any) -> "Begun":
         """The same beginning with other numbers."""
         begun = object.__new__(Begun)
-        begun.__dict__.update(self.__dict__, **numbers)
+        begun.__dict__ = {**self.__dict__, **numbers}
         return begun
 
 
@@ -221,7 +221,7 @@ def _begun(settings: Settings, case: Case, steps: int, save_every: int, asked: i
     # start
     if not traced:
         complete = {name: a if case.batch is None else a[0] for name, a in initial.data.items()}
-        refuse_wrong_shapes(equation, {**complete, "t": np.asarray(case.t0)}, case.h, own)
+        refuse_wrong_shapes(system, equation, {**complete, "t": np.asarray(case.t0)}, case.h, own)
     equation = lifted(equation, case.params, case.batch_params)
     start = begun(equation, case, initial, by_jax)
     # user functions that close over a traced value make the start traced although nothing that was passed is

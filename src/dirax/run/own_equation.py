@@ -59,12 +59,24 @@ def _returned(what: str, function: Callable, *arguments: Any) -> Any:
         raise TypeError(f"{what} could not be traced by JAX: {why_untraced(error, arguments[-1])}") from error
 
 
-def refuse_wrong_shapes(equation: Any, data: Mapping[str, Any], h: Any, params: Any) -> None:
-    """Raise `ValueError` where a function of a stage that is not dirax's own returns what its sizes and fields do not say; `data`
-    are the complete ones of one trajectory."""
+def refuse_wrong_shapes(system: Any, equation: Any, data: Mapping[str, Any], h: Any, params: Any) -> None:
+    """Raise `ValueError` where a function of a stage that is not dirax's own returns what its sizes and fields do not say, and
+    where the energy of such a system is not one number; `data` are the complete ones of one trajectory."""
+    if package_of(system) != "dirax":
+        _refuse_energies(system, equation, params)
     for stage, _ in equation.stages:
         if package_of(stage.residual) != "dirax":
             _asked.get(Same(stage), lambda stage=stage: _ask(stage, data, h, params))
+
+
+def _refuse_energies(system: Any, equation: Any, params: Any) -> None:
+    nodes = {name: jax.ShapeDtypeStruct(f.shape, np.float64) for name, f in equation.fields.items() if f.place == "node"}
+    try:
+        found = jax.eval_shape(system.energy_at, {**nodes, "t": jax.ShapeDtypeStruct((), np.float64)}, params)
+    except Exception:  # it asks for what these rows do not hold, or is not there: nothing asks for it in a run
+        return
+    if np.shape(found) != ():
+        raise ValueError(f"energy_at of {type(system).__name__} must return one number, but it returned {_said(found)}.")
 
 
 def _ask(stage: StepEquation, data: Mapping[str, Any], h: Any, params: Any) -> bool:

@@ -136,9 +136,10 @@ class Kernels:
         """The compiled `run` that finds the sizes, and whether it came from a cache; None where they are not written as nodes,
         and as long as runs have spent less than a part of what its compilation takes, unless they are said to be found `often`.
         """
-        worth = often or self.sizing > SIZING * self.operations / self.repeated
-        if width in self._of_sizes or not worth or not self.step.sizes_are_written:
-            return self._of_sizes.get(width), True
+        if width in self._of_sizes:
+            return self._of_sizes[width], True
+        if not (often or self.sizing > SIZING * self.operations / self.repeated) or not self.step.sizes_are_written:
+            return None, True
         text = lambda: sizes_module(self._planned(), width, llvm.has_fma())
         found = self._library("run", width, text, "sizes", levels=(SOON,))
         self._of_sizes[width] = llvm.function(found.library, "run", SIGNATURE)
