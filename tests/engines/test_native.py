@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 import dirax as dx
 from dirax.engines.contract import NOT_CONVERGED, NOT_FINITE, OK, Problem
-from dirax.engines.native import Native
+from dirax.engines.native import Native, at_once, shared
 from dirax.engines.native import kernels as of_steps
 from dirax.engines.native import run as driver
 from dirax.engines.native.ir.emitter import LONG, Body, Emitter, Module
@@ -439,6 +439,7 @@ def test_long_code_is_in_short_blocks():
 
 def compiled_levels(monkeypatch) -> list[int]:
     """The levels at which kernels are compiled from now on, those of few operations as those of many."""
+    shared.addresses(), at_once.Orders()  # what is compiled once in a process
     levels, compiled = [], llvm.object_code
     monkeypatch.setattr(of_steps, "FEW", 0)
 

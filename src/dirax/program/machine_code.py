@@ -3,6 +3,8 @@
 import functools
 import itertools
 import platform
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 import llvmlite
@@ -92,11 +94,14 @@ def _jit(block: int):
     return llvm.create_lljit_compiler(use_jit_link=True)
 
 
-def load(code: bytes, names: tuple[str, ...]):
-    """The object code linked into this process: a tracker that keeps it alive and gives addresses by name."""
+def load(code: bytes, names: tuple[str, ...], known: Mapping[str, int] = MappingProxyType({})):
+    """The object code linked into this process: a tracker that keeps it alive and gives addresses by name; `known` are those of
+    other functions that it calls."""
     builder = llvm.JITLibraryBuilder().add_object_img(code).add_current_process()
     for name in names:
         builder.export_symbol(name)
+    for name, address in known.items():
+        builder.import_symbol(name, address)
     number = next(_numbers)
     return builder.link(_jit(number // LINKED_TOGETHER), f"dirax_kernel_{number}")
 

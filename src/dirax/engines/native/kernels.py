@@ -16,6 +16,7 @@ from dirax.engines.native.loops.plan import Plan
 from dirax.engines.native.loops.record import Record
 from dirax.engines.native.loops.sizes import sizes_module
 from dirax.engines.native.loops.step_loop import kernel_module
+from dirax.engines.native.shared import addresses
 from dirax.engines.newton_step import newton_corrections
 from dirax.engines.step_program import KEPT, StepProgram, step_program
 from dirax.program import graph as graph_module
@@ -212,12 +213,12 @@ def linked(
         stored = kernel_cache.read(entry)
         if stored is not None:
             with contextlib.suppress(RuntimeError):  # the linker does not take it: it is compiled anew
-                return Linked(llvm.load(stored.code, (name,)), stored.operations, True, level)
+                return Linked(llvm.load(stored.code, (name,), addresses()), stored.operations, True, level)
     ir = text()
     level = levels[0] if operations() <= FEW else levels[-1]
     code = llvm.object_code(ir, level=level)
     kernel_cache.write(entries[level], kernel_cache.Kernel(operations(), code))
-    return Linked(llvm.load(code, (name,)), operations(), False, level)
+    return Linked(llvm.load(code, (name,), addresses()), operations(), False, level)
 
 
 def too_large(error: GraphTooLarge) -> UnsupportedPrimitive:

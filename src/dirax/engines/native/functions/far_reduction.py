@@ -12,7 +12,7 @@ NEAR = 2.0**20
 FAR_NAME = "far_reduction"
 
 
-def add_far_reduction(module: Module) -> None:
+def add_far_reduction(module: Module, linkage: str = "internal ") -> None:
     """`far_reduction(x, high, low, quadrant, count)`: the same reduction for the entries of x beyond `NEAR`, in place.
 
     x = m·2^e with a whole m < 2^53. Of the product m·(2/π)·2^e the bits above the point modulo 4 are the quadrant and
@@ -29,6 +29,7 @@ def add_far_reduction(module: Module) -> None:
     numbers["half_pi_low"] = e.const(c.PI_2[1])
     module.functions.append(
         FAR_REDUCTION.format(
+            linkage=linkage,
             name=FAR_NAME,
             n=len(c.TWO_OVER_PI),
             take_size="\n".join(head),
@@ -42,7 +43,7 @@ def add_far_reduction(module: Module) -> None:
 
 
 FAR_REDUCTION = """
-define internal void @{name}(ptr %x, ptr %high, ptr %low, ptr %quadrant, i64 %count) noinline cold {{
+define {linkage}void @{name}(ptr %x, ptr %high, ptr %low, ptr %quadrant, i64 %count) noinline cold {{
 entry:
   br label %loop
 loop:

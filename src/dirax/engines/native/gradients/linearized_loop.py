@@ -12,11 +12,10 @@ units. Rows hold the state and the unknowns of a stage, then what flows in or ou
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from dirax.engines.native.functions.far_reduction import add_far_reduction
 from dirax.engines.native.ir.emitter import Body, Emitter, Module
 from dirax.engines.native.ir.lower import Region
-from dirax.engines.native.loops.dense import add_dense_solve
 from dirax.engines.native.loops.newton_loop import by_partial_pivoting
+from dirax.engines.native.shared import declare_shared
 from dirax.engines.newton_step import Factors, terms_of_rows
 from dirax.engines.pivot_order import pivot_order
 from dirax.engines.step_program import Inputs, TracedEquation
@@ -137,8 +136,7 @@ class LinearizedLoop:
     def module(self, width: int, fma: bool) -> str:
         """IR of `linearized(carry, numbers, rows, flow, blocks, …)` for consecutive blocks of `width` lanes."""
         module = Module(fma)
-        add_far_reduction(module)
-        add_dense_solve(module)
+        declare_shared(module)
         _Block(self, module, width).define()
         body = Body(module)
         rows = body.put(f"mul i64 %count, {len(self.stages) * self.row * width * 8}")

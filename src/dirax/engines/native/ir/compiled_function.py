@@ -5,9 +5,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dirax.engines.native.functions.far_reduction import add_far_reduction
 from dirax.engines.native.ir.emitter import Body, Emitter, Module
 from dirax.engines.native.ir.lower import Region
+from dirax.engines.native.shared import addresses, declare_shared
 from dirax.program import machine_code as llvm
 from dirax.program.graph import Graph
 
@@ -15,7 +15,7 @@ from dirax.program.graph import Graph
 def function_module(graph: Graph, inputs: Sequence[int], outputs: Sequence[int], width: int, fma: bool) -> str:
     """IR of `evaluate(inputs, outputs, count)`: rows of `width` entries, inputs (count, inputs, width)."""
     module = Module(fma)
-    add_far_reduction(module)
+    declare_shared(module)
     body = Body(module)
     e = Emitter(body, width)
     with body.loop(0, "%count") as i:
@@ -40,7 +40,7 @@ def function_module(graph: Graph, inputs: Sequence[int], outputs: Sequence[int],
 def loaded(graph: Graph, inputs: Sequence[int], outputs: Sequence[int], width: int = 1):
     """The compiled `evaluate(inputs, outputs, count)`, called with addresses."""
     text = function_module(graph, inputs, outputs, width, llvm.has_fma())
-    library = llvm.load(llvm.object_code(text), ("evaluate",))
+    library = llvm.load(llvm.object_code(text), ("evaluate",), addresses())
     call = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)(library["evaluate"])
     call.library = library  # type: ignore[attr-defined]  # keeps the code alive
     return call

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 
 from dirax.engines.contract import NOT_CONVERGED, NOT_FINITE, OK
-from dirax.engines.native.functions.far_reduction import add_far_reduction
 from dirax.engines.native.ir.emitter import Body, Module
 from dirax.engines.native.ir.lower import Region
 from dirax.engines.native.loops.collocation_iteration import Iteration
@@ -14,13 +13,14 @@ from dirax.engines.native.loops.collocation_sweeps import FirstOrder, SecondOrde
 from dirax.engines.native.loops.complex_inverse import add_complex_inverse
 from dirax.engines.native.loops.simplified_newton import Eigenbasis, InEigenbasis, SimplifiedNewton, SimplifiedNewtonOfMeans
 from dirax.engines.native.loops.step_loop import NUMBERS, define_run
+from dirax.engines.native.shared import declare_shared
 
 
 def collocation_module(plan: CollocationPlan | MeanPlan, trajectories: int, fma: bool, newton: bool = False) -> str:
     """IR of `run(lanes, params, outs, blocks, …)`: so many trajectories a block. With `newton`, of one trajectory, Newton's
     method in the eigenbasis of A takes the place of the fixed-point iteration."""
     module = Module(fma)
-    add_far_reduction(module)
+    declare_shared(module)
     if newton:
         add_complex_inverse(module, len(plan.relation.first))
         _Kernel(plan, module, 1, SimplifiedNewtonOfMeans if isinstance(plan, MeanPlan) else SimplifiedNewton).define()

@@ -2,6 +2,8 @@
 
 from dirax.engines.native.ir.emitter import Body, Emitter, Module
 
+DENSE_NAME = "dense_solve"
+
 
 def add_dense_solve(module: Module) -> None:
     """`dense_solve(a, b, x, scratch, k, stride)`: a x = b for (k, k) doubles `stride` apart; scratch holds k (k + 1)."""
@@ -52,6 +54,4 @@ def add_dense_solve(module: Module) -> None:
         value = e.div(body.load("double", total), body.load("double", entry(i, i)))
         body.store("double", value, strided("%x", i))
     body.line("ret void")
-    module.define(
-        "define internal void @dense_solve(ptr %a, ptr %b, ptr %x, ptr %scratch, i64 %k, i64 %stride) noinline cold", body
-    )
+    module.define(f"define void @{DENSE_NAME}(ptr %a, ptr %b, ptr %x, ptr %scratch, i64 %k, i64 %stride) noinline cold", body)

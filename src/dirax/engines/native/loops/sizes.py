@@ -3,12 +3,12 @@
 from dataclasses import replace
 
 from dirax.engines.first_sizes import FirstSizes, Linearized
-from dirax.engines.native.functions.far_reduction import add_far_reduction
 from dirax.engines.native.ir.emitter import Body, Emitter, Module
 from dirax.engines.native.ir.lower import Region
 from dirax.engines.native.loops.plan import Plan
 from dirax.engines.native.loops.record import DOUBTFUL
 from dirax.engines.native.loops.step_loop import NUMBERS, define_run
+from dirax.engines.native.shared import declare_shared
 from dirax.numerics.equilibration import BETWEEN, LEAST_SIZE
 
 EXPONENT = 0x7FF << 52
@@ -20,7 +20,7 @@ def sizes_module(plan: Plan, width: int, fma: bool) -> str:
     record, into lanes that have none. A lane in which they are in doubt has the outcome `DOUBTFUL`."""
     plan = replace(plan, graph=plan.graph.copy())  # which has room for them, and the other kernels' graph stays as it is
     module = Module(fma, groups=False)
-    add_far_reduction(module)
+    declare_shared(module)
     _define_block(plan, module, width)
     define_run(module, [count * width * 8 for count in (plan.record.size, len(plan.shared.params), 0)])
     return module.text()

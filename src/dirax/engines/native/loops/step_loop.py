@@ -3,13 +3,12 @@
 from collections.abc import Callable, Sequence
 
 from dirax.engines.contract import OK
-from dirax.engines.native.functions.far_reduction import add_far_reduction
 from dirax.engines.native.ir.emitter import Body, Emitter, Module
 from dirax.engines.native.ir.lower import Region
-from dirax.engines.native.loops.dense import add_dense_solve
 from dirax.engines.native.loops.plan import RUN, Plan, frontier
 from dirax.engines.native.loops.record import Frame, Record
 from dirax.engines.native.loops.stage import Block, bind_sizes, emit_stage
+from dirax.engines.native.shared import declare_shared
 
 WRITTEN_OUT = 64
 """Unknowns of all stages up to which there is no loop over them."""
@@ -21,8 +20,7 @@ NUMBERS = "double %t0, double %h, i64 %offset, i64 %first, i64 %stop, i64 %every
 def kernel_module(plan: Plan, width: int, fma: bool, groups: bool = True) -> str:
     """IR of `run(lanes, params, outs, blocks, …)`: the kernel for blocks of `width` lanes; `groups` as of `Module`."""
     module = Module(fma, groups)
-    add_far_reduction(module)
-    add_dense_solve(module)
+    declare_shared(module)
     _define_block(plan, module, width)
     define_run(module, [count * width * 8 for count in (plan.record.size, len(plan.shared.params), len(plan.fields))])
     return module.text()
