@@ -3,8 +3,10 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
+from jax import lax
 
-import dirax.program.rules  # noqa: F401  (registers the rules)
+import dirax as dx
 from dirax.program.rounding import rounding
 
 
@@ -16,3 +18,41 @@ def test_xla_is_given_no_large_graph():
     assert terms.as_text().count("\n") < 1000
     expected = products(x) + jnp.abs(jax.jacfwd(products)(x)) @ jnp.abs(x)
     np.testing.assert_allclose(terms.compile()(x), expected, rtol=1e-13)
+
+
+def rounds(count):
+    """y + y³ = c by Newton's method."""
+    return lambda c: lax.fori_loop(0, count, lambda _, y: y - (y + y**3 - c) / (1 + 3 * y**2), c)
+
+
+def test_an_iteration_that_contracts_is_no_sum_of_its_rounds():
+    c = jnp.array([0.3, -2.0, 50.0])
+    few, many = (jax.vmap(lambda c, count=count: rounding(rounds(count), c))(c) for count in (8, 80))
+    assert np.all(many < 1e4 * jnp.abs(rounds(80)(c))) and np.all(many > jnp.abs(rounds(80)(c)) / 2)
+    assert np.all(few > jnp.abs(rounds(8)(c)))
+
+
+def test_long_sums_keep_their_terms():
+    x = jnp.linspace(1.0, 2.0, 80)
+    summed = lambda x: lax.fori_loop(0, 80, lambda i, s: s + x[i], 0.0)
+    assert rounding(lambda x: summed(x) - summed(x[::-1]), x) > jnp.sum(x)
+
+
+@pytest.mark.parametrize("engine", ["native", "xla"])
+def test_roots_inside_of_a_lagrangian_leave_steps_their_digits(engine):
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - rounds(40)(q[0]) ** 2)
+    sol = dx.simulate(system, dx.LagrangeDAlembert(), q=[0.5], v=[0.3], step=0.1, steps=20, engine=engine)
+
+    def force(q):
+        y = q
+        for _ in range(40):
+            y -= (y + y**3 - q) / (1 + 3 * y**2)
+        return -2 * y / (1 + 3 * y**2)
+
+    q, p = 0.5, 0.3
+    for _ in range(20):
+        w = p
+        for _ in range(60):
+            w = p + 0.05 * force(q + 0.05 * w)
+        q, p = q + 0.1 * w, p + 0.1 * force(q + 0.05 * w)
+    assert abs(sol.q[-1, 0] - q) < 1e-14
