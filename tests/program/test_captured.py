@@ -191,7 +191,7 @@ def test_what_is_the_same_value_is_no_change(monkeypatch):
     end(system)
     monkeypatch.setitem(globals(), "stiffness", float("1.0"))
     assert calls and not system.lagrangian.captured.changed()
-    assert pickle.loads(pickle.dumps(Captured(by_global))).watched[0].before == 1.0
+    assert {each.words: each.before for each in pickle.loads(pickle.dumps(Captured(by_global))).watched}["stiffness"] == 1.0
 
 
 @pytest.mark.parametrize("kind", [dx.Event, dx.Impact])
@@ -347,6 +347,55 @@ def test_functions_that_a_library_wraps_are_looked_into(wrapped):
     assert not captured.changed()
     own["k"] = 4.0
     assert captured.changed() == "own['k'], which was 1.0 when it was stated and is 4.0 now"
+
+
+def exact(k):
+    """The end of that motion by the midpoint rule."""
+    return np.cos(2000 * np.arctan(np.sqrt(k) / 2000))
+
+
+def wrapped_anew(wrapped):
+    def of(k):
+        globals()["helper"] = wrapped(lambda q: k * q * q / 2)
+        return dx.LagrangeDirac(lambda q, v: v @ v / 2 - jnp.sum(helper(q)))
+
+    return of
+
+
+def by_default(k):
+    globals()["helper"] = lambda q, k=k: k * q @ q / 2
+    return dx.LagrangeDirac(lambda q, v: v @ v / 2 - helper(q))
+
+
+def by_keyword(k):
+    globals()["helper"] = lambda q, *, k=k: k * q @ q / 2
+    return dx.LagrangeDirac(lambda q, v: v @ v / 2 - helper(q))
+
+
+def by_code(k):
+    """As modules that are loaded again put it there."""
+    helper = globals().setdefault("reloaded", lambda q: q @ q / 2)
+    helper.__code__ = (lambda q: q @ q / 2).__code__ if k == 1.0 else (lambda q: 4.0 * q @ q / 2).__code__
+    return dx.LagrangeDirac(lambda q, v: v @ v / 2 - reloaded(q))
+
+
+ANEW = {
+    "vmap": wrapped_anew(jax.vmap),
+    "jit": wrapped_anew(jax.jit),
+    "default": by_default,
+    "keyword": by_keyword,
+    "code": by_code,
+}
+
+
+@pytest.mark.parametrize("stated", ANEW.values(), ids=ANEW)
+def test_a_helper_that_is_another_one_is_another_system(stated):
+    """The functions of both systems have the same code."""
+    first = stated(1.0)
+    assert end(first) == pytest.approx(exact(1.0), abs=1e-12)
+    assert end(stated(4.0)) == pytest.approx(exact(4.0), abs=1e-12)
+    with pytest.raises(ValueError, match=r"lagrangian reads .*helper|lagrangian reads reloaded, whose code is not what it was"):
+        end(first)
 
 
 def test_rules_of_derivatives_are_looked_into():

@@ -31,6 +31,7 @@ from dirax.program.outside_values import (
     is_of_library,
     item,
     package_of,
+    package_of_code,
     read_by,
     root_of,
     with_methods,
@@ -93,6 +94,8 @@ class Captured:
             if (now := read()) is not before and not _alike(now, before):
                 if isinstance(before, Contents):
                     return f"{words}, in which there is something else than when it was stated"
+                if isinstance(before, types.CodeType):
+                    return f"{words}, whose code is not what it was when it was stated"
                 return f"{words}, which was {_short(before)} when it was stated and is {_short(now)} now"
         return ""
 
@@ -124,7 +127,7 @@ class Captured:
             for part in (function, *beside_inner(value)):
                 self._follow(part, words, names, depth)
         elif isinstance(value, types.FunctionType):
-            self._follow_function(value, depth)
+            self._follow_function(value, words or value.__name__, depth)
         elif isinstance(value, Mapping):
             keys = lambda: [*itertools.islice(value, MOST)]
             self.watched.append(Watched(f"the keys of {words}", keys, keys()))
@@ -162,9 +165,14 @@ class Captured:
         if is_object and len(self.watched) == count and not callable(value) and root_of(value) not in NOT_OF_VALUES:
             self._by_contents(words, lambda: written(value))
 
-    def _follow_function(self, function: types.FunctionType, depth: int) -> None:
+    def _follow_function(self, function: types.FunctionType, words: str, depth: int) -> None:
         if package_of(function) in LIBRARIES:
             return
+        if package_of(function) != "dirax":  # a module that is loaded again puts other code into the functions of before
+            self.watched.append(Watched(words, lambda: function.__code__, function.__code__))
+            for name in ("__defaults__", "__kwdefaults__"):
+                if (before := getattr(function, name)) is not None:
+                    self.watched.append(Watched(f"the defaults of {words}", functools.partial(getattr, function, name), before))
         names = _attributes(function, set())
         for part in (*(function.__defaults__ or ()), *(function.__kwdefaults__ or {}).values()):
             self._follow(part, "a default", names, depth + 1)
@@ -226,17 +234,28 @@ def refuse_changed(captured: Iterable[tuple[str, Captured]]) -> None:
 def _alike(now: Any, before: Any) -> bool:
     """Whether two objects are one value to a function."""
     if isinstance(now, types.FunctionType) and isinstance(before, types.FunctionType):
-        return now.__code__ == before.__code__ and _same_values(now, before)
+        same = _same_parts if package_of_code(now) in LIBRARIES else _same_values
+        return now.__code__ == before.__code__ and same(now, before)
     if isinstance(now, np.ndarray | jax.Array) and isinstance(before, np.ndarray | jax.Array):
         if isinstance(now, Tracer) or isinstance(before, Tracer) or now.dtype != before.dtype or now.shape != before.shape:
             return False
         return np.asarray(now).tobytes() == np.asarray(before).tobytes()
     if type(now) is not type(before):
         return False
+    if type(now) is tuple:
+        return len(now) == len(before) and all(x is y or _alike(x, y) for x, y in zip(now, before, strict=True))
+    if type(now) is dict:
+        return now.keys() == before.keys() and all(x is before[name] or _alike(x, before[name]) for name, x in now.items())
     try:
         return bool(now == before) or bool(now != now and before != before)
     except Exception:  # values that have no truth
         return False
+
+
+def _same_parts(one: types.FunctionType, other: types.FunctionType) -> bool:
+    """Whether two functions of a library, such as those that it makes of a user's, hold the same."""
+    parts = lambda f: (f.__defaults__, f.__kwdefaults__, *map(contents, f.__closure__ or ()))
+    return _alike(parts(one), parts(other))
 
 
 def _same_values(one: Callable, other: Callable) -> bool:
