@@ -21,6 +21,9 @@ from dirax.solution.trajectory import ROWS_BEFORE, SavedRow, last_rows
 MOST_OPERATIONS = 4e7
 """Scalar operations of the steps that are taken again, a few tenths of a second: of longer runs as many rows, evenly spread."""
 
+MOST = 10_000
+"""Rows that are taken again at most."""
+
 FEWEST, CALL = 16, 2048
 """Rows that are taken again at least, and states of which a function in NumPy takes as long as of one."""
 
@@ -174,7 +177,7 @@ class Replay:
         lanes, rows = np.nonzero((np.arange(self.sol.rows)[None] <= self.ends[:, None]) & ~self.beside_walls)
         if not len(rows):
             raise CannotReplay("walls divide every step")
-        most = max(FEWEST, int(MOST_OPERATIONS / self.steps.operations() / self._steps_a_row))
+        most = min(MOST, max(FEWEST, int(MOST_OPERATIONS / self.steps.operations() / self._steps_a_row)))
         if len(rows) > most:
             some = np.unique(np.linspace(0, len(rows) - 2, most // 2).astype(int))
             some = np.union1d(some, some + 1)  # with their successors

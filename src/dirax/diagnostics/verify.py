@@ -43,9 +43,9 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
     (absolute Jacobian times |q|). The tolerances are roundoff's:
 
     - steps replayed: every saved number of every row, of any scheme and of compositions, against the step from the row before,
-      taken again in NumPy: 32 ε of what it would be off if every operation were; of long runs as many rows as a few tenths of
-      a second are enough for, and the line says so; of rows very many steps apart a few, by the engine of the run: 32 ε · steps
-      of what it moves with the state before;
+      taken again in NumPy: 32 ε of what it would be off if every operation were; of long runs 10 000 rows, or as many as a few
+      tenths of a second are enough for, evenly spread, and the line says so; of rows very many steps apart a few, by the engine
+      of the run: 32 ε · steps of what it moves with the state before;
     - points of manifolds and elements of groups, in every row: 32 ε off them, or what the initial data were;
     - discrete Dirac structure of every step ([PY] Proposition 5.17, Theorem 6.8; [BLM] Definition 5.1), saved momenta and
       multipliers against those of the points, constraint: 32 ε, because these hold step by step;
