@@ -16,6 +16,7 @@ from dirax.engines.native.kernels import Kernels, kernels
 from dirax.engines.native.lanes import arrays_saved
 from dirax.engines.native.loops.collocation_loop import collocation_module
 from dirax.engines.native.loops.step_loop import kernel_module
+from dirax.engines.native.shared import shared_module
 from dirax.engines.sizes import sizes_of
 from dirax.program import machine_code as llvm
 from dirax.program.interpreter import UnsupportedPrimitive
@@ -158,7 +159,7 @@ def c_program(p: Problem, name: str, title: str) -> str:
         title=title.replace("*/", "* /"),
         name=name,
         fma="-mfma " * fma,
-        code=c_code(module),
+        code=c_code(shared_module(fma) + module),
         lanes=lanes,
         lane='printf("%lld,", (long long)lane); ' if p.batch else "",
         parameters=values.shape[-1],

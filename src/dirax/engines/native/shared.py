@@ -23,9 +23,14 @@ def addresses() -> dict[str, int]:
     return {name: library[name] for name in DECLARED}
 
 
-@functools.cache
-def _library() -> Any:
-    module = Module(llvm.has_fma())
+def shared_module(fma: bool) -> str:
+    """IR of them."""
+    module = Module(fma)
     add_far_reduction(module, "")
     add_dense_solve(module)
-    return llvm.load(llvm.object_code(module.text(), level=0), tuple(DECLARED))
+    return module.text()
+
+
+@functools.cache
+def _library() -> Any:
+    return llvm.load(llvm.object_code(shared_module(llvm.has_fma()), level=0), tuple(DECLARED))
