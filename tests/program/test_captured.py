@@ -398,6 +398,23 @@ def test_a_helper_that_is_another_one_is_another_system(stated):
         end(first)
 
 
+@pytest.mark.parametrize("made", [jax.jit, jax.checkpoint, eqx.filter_jit])
+def test_functions_of_which_jax_keeps_what_it_traced_are_made_anew(made):
+    own = {"k": 1.0}
+    anew = lambda: lambda q: own["k"] * q @ q / 2
+    stated = lambda potential: dx.LagrangeDirac(lambda q, v: v @ v / 2 - potential(q))
+    function = anew()
+    potential = made(function)
+    assert end(stated(potential)) == pytest.approx(exact(1.0), abs=1e-12)
+    own["k"] = 4.0
+    for late in (potential, made(function)):
+        with pytest.raises(ValueError, match=r"reads own\['k'\], which was 1.0 .* JAX keeps what it traced .* the function anew"):
+            end(stated(late))
+    assert end(stated(made(anew()))) == pytest.approx(exact(4.0), abs=1e-12)
+    own["k"] = 1.0
+    assert end(stated(potential)) == pytest.approx(exact(1.0), abs=1e-12)
+
+
 def test_rules_of_derivatives_are_looked_into():
     own = {"k": 1.0}
     potential = jax.custom_jvp(lambda q: q @ q / 2)

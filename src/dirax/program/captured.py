@@ -8,6 +8,7 @@ import argparse
 import functools
 import itertools
 import types
+import weakref
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
@@ -30,6 +31,7 @@ from dirax.program.outside_values import (
     is_installed,
     is_of_library,
     item,
+    keeps_traces,
     package_of,
     package_of_code,
     read_by,
@@ -74,6 +76,8 @@ class Captured:
 
     def __init__(self, function: Callable):
         self.watched: list[Watched] = []
+        self.stale = ""
+        """What a function reads that JAX has traced before, and keeps, with another value."""
         self._seen: set[int] = set()
         self._follow(function, "", _methods_of(function) if isinstance(function, type) else frozenset(), 0)
         del self._seen
@@ -124,6 +128,8 @@ class Captured:
             own = getattr(value.__func__, "__code__", None)
             self._follow(value.__self__, words or "self", names | reads(own).others if own else names, depth + 1)
         elif (function := inner(value)) is not value:
+            if keeps_traces(value):
+                self.stale = self.stale or _changed_since_traced(value.__wrapped__)
             for part in (function, *beside_inner(value)):
                 self._follow(part, words, names, depth)
         elif isinstance(value, types.FunctionType):
@@ -221,9 +227,28 @@ class ReadsChanged(ValueError):
     """A function reads what is no longer what it was when it was stated."""
 
 
+_kept: "weakref.WeakKeyDictionary[Any, Captured]" = weakref.WeakKeyDictionary()
+"""What functions read when a system was first stated with them, of which JAX keeps what it traced."""
+
+
+def _changed_since_traced(function: Any) -> str:
+    """In words, what such a function reads that is not what it was then."""
+    try:
+        if function not in _kept:
+            _kept[function] = Captured(function)
+        return _kept[function].changed()
+    except TypeError:  # nothing that can be kept in mind
+        return ""
+
+
 def refuse_changed(captured: Iterable[tuple[str, Captured]]) -> None:
     """Raise `ReadsChanged` where functions (their name, what they read) would run with values that are not those of now."""
     for name, each in captured:
+        if each.stale:
+            raise ReadsChanged(
+                f"{name} reads {each.stale}, inside of a function that jax.jit or jax.checkpoint has made, and JAX keeps what it "
+                "traced of that then: make the function anew, leave jax.jit away, or hand the value over in params."
+            )
         if words := each.changed():
             raise ReadsChanged(
                 f"{name} reads {words}; what was traced of it keeps the old value: state it again for the new one, or hand the "

@@ -6,6 +6,8 @@ import sys
 import types
 from typing import Any
 
+import jax
+
 from dirax.program.code_reads import reads
 
 LARGEST_WRITTEN = 2**20
@@ -83,6 +85,26 @@ def inner(value: Any) -> Any:
         wrapped = getattr(value, "__wrapped__", value)
         return value if wrapped is value else inner(wrapped)
     return value
+
+
+def keeps_traces(value: Any) -> bool:
+    """Whether JAX keeps what it traced of a function that was made by `jax.jit`, `jax.checkpoint` or `eqx.filter_jit`, whatever
+    that reads is now."""
+    if isinstance(value, types.FunctionType):
+        return any(code in _checkpoint() for code in _codes_inside(value))
+    return package_of_code(value) in ("jax", "jaxlib", "equinox") and hasattr(value, "lower")
+
+
+@functools.cache
+def _checkpoint() -> frozenset[types.CodeType]:
+    """The code inside of what `jax.checkpoint` makes."""
+    sample = lambda: None
+    return frozenset(_codes_inside(jax.checkpoint(sample))) - {sample.__code__}
+
+
+def _codes_inside(function: types.FunctionType) -> list[types.CodeType]:
+    held = map(contents, function.__closure__ or ())
+    return [part.__code__ for part in held if isinstance(part, types.FunctionType)]
 
 
 def beside_inner(value: Any) -> list[types.FunctionType]:
