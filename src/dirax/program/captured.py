@@ -8,7 +8,6 @@ import argparse
 import functools
 import itertools
 import types
-import weakref
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
@@ -227,18 +226,13 @@ class ReadsChanged(ValueError):
     """A function reads what is no longer what it was when it was stated."""
 
 
-_kept: "weakref.WeakKeyDictionary[Any, Captured]" = weakref.WeakKeyDictionary()
+_kept: "Memo[Captured]" = Memo(256)
 """What functions read when a system was first stated with them, of which JAX keeps what it traced."""
 
 
 def _changed_since_traced(function: Any) -> str:
     """In words, what such a function reads that is not what it was then."""
-    try:
-        if function not in _kept:
-            _kept[function] = Captured(function)
-        return _kept[function].changed()
-    except TypeError:  # nothing that can be kept in mind
-        return ""
+    return _kept.get(Same(function), lambda: Captured(function)).changed()
 
 
 def refuse_changed(captured: Iterable[tuple[str, Captured]]) -> None:
