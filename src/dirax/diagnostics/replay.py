@@ -21,8 +21,8 @@ from dirax.solution.trajectory import ROWS_BEFORE, SavedRow, last_rows
 MOST_OPERATIONS = 4e7
 """Scalar operations of the steps that are taken again, a few tenths of a second: of longer runs as many rows, evenly spread."""
 
-MOST = 10_000
-"""Rows that are taken again at most."""
+MOST = 10_001
+"""Rows that are taken again at most: those of 10 000 steps."""
 
 FEWEST, CALL = 16, 2048
 """Rows that are taken again at least, and states of which a function in NumPy takes as long as of one."""
