@@ -36,7 +36,7 @@ def regularity(sol: Solution) -> Line | None:
     t, q = np.array([[sol.time_of(row, lane) for row in rows] for lane in range(lanes)]), _of_rows(sol, sol.fields["q"], rows)
     params = _of_lanes(sol, lanes)
     program = program_at(sol.system.velocity_hessian, (t[0, 0], q[0, 0], q[0, 0], jax.tree.map(lambda leaf: leaf[0], params)))
-    if program is None or program.opaque or not any(map(program.depends_on, program.inputs[:3])):
+    if program is None or program.opaque or not program.depends_on(*program.inputs[:3]):
         return None
     v = np.zeros_like(q)
     if program.depends_on(program.inputs[2]):

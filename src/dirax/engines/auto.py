@@ -81,20 +81,14 @@ class Auto(AbstractEngine):
         outcome.notes |= {"not_native": reason, **notes}
         return outcome
 
-    def _by_arrays(self, problem: Problem) -> tuple[AbstractEngine, dict[str, str]]:
+    def _by_arrays(self, problem: Problem) -> tuple[AbstractEngine, dict[str, str | None]]:
         """The sparse engine or the xla engine, and why not the former. Raises `ValueError` for dense steps that are too large."""
         if problem.size < policy.FEWEST_SPARSE:
             return Xla(), {}
-        if (reason := _full(problem)) is None:
-            try:
-                sparse = policy.engine_of("sparse", only_quicker=True)
-                reason = sparse.supports(problem)
-            except ImportError as error:
-                reason = str(error)
-            else:
-                if reason is None:
-                    return sparse, {}
         unknowns = max(stage.unknowns for stage, _ in problem.equation.stages)
+        sparse, reason = _sparse(problem, unknowns)
+        if sparse is not None:
+            return sparse, {}
         if unknowns > policy.LARGEST_DENSE:
             raise ValueError(
                 f"a step of {unknowns} unknowns that is not sparse takes a matrix of {8e-9 * unknowns**2:.3g} GB: {reason}. Take "
@@ -105,9 +99,20 @@ class Auto(AbstractEngine):
         return Xla(), {"not_sparse": reason}
 
 
-def _full(p: Problem) -> str | None:
+def _sparse(problem: Problem, unknowns: int) -> tuple[AbstractEngine | None, str | None]:
+    """The sparse engine, or why it does not take the problem."""
+    if full := _full(problem, unknowns):
+        return None, full
+    try:
+        sparse = policy.engine_of("sparse", only_quicker=True)
+        reason = sparse.supports(problem)
+    except ImportError as error:
+        return None, str(error)
+    return (sparse, None) if reason is None else (None, reason)
+
+
+def _full(p: Problem, unknowns: int) -> str | None:
     """Why a step of moderate size is not sparse, which its scalar program says at once; None where it does not."""
-    unknowns = max(stage.unknowns for stage, _ in p.equation.stages)
     if p.size > policy.LARGEST_NATIVE:
         return None
     try:

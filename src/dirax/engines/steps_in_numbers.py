@@ -82,15 +82,12 @@ class StepsInNumbers:
     _depends: list[set[int]] = field(init=False)
     _reads: ReadAgain = field(init=False)
     _slopes: dict[tuple[int, ...], Slopes] = field(init=False, default_factory=dict)
-    _sweeps: list[Slopes] | None = field(init=False)
-    """How the Jacobians are found in numbers; None where they are nodes."""
 
     def __post_init__(self):
-        self._sweeps = None
-        if self.program.is_swept:
-            self._sweeps = [Slopes(self.program.graph, e.residual, e.unknowns) for e in self.program.equations]
+        if self.program.is_swept:  # with its derivatives the graph has all its nodes
+            _ = [self._plan(e.residual, e.unknowns) for e in self.program.equations]
         else:
-            _ = self.program.jacobians  # with which the graph has all its nodes
+            _ = self.program.jacobians
         self._reads = ReadAgain(self.program.graph)
         self._depends = [self._moving(e.unknowns) for e in self.program.equations]
 
@@ -118,7 +115,8 @@ class StepsInNumbers:
         inverted. A function takes as long as of `call` states, at least."""
         total, nodes = 0, len(self.program.graph)
         for index, _ in self.program.stages:
-            k, swept = len(self.program.equations[index].unknowns), self._sweeps[index].size if self._sweeps else 0
+            e = self.program.equations[index]
+            k, swept = len(e.unknowns), self._plan(e.residual, e.unknowns).size if self.program.is_swept else 0
             total += max(states, call) * nodes + states * (k**3 + k * swept)
         return 4 * total
 
@@ -442,9 +440,8 @@ class StepsInNumbers:
     def _linearized(self, index: int, known: Values) -> tuple[np.ndarray, np.ndarray]:
         """The Jacobians (states, k, k) of a residual, and the residuals."""
         e = self.program.equations[index]
-        if self._sweeps is not None:
-            slopes = known.slopes(e.residual, e.unknowns, self._sweeps[index])
-            return slopes, known.read(_nodes(e.residual))
+        if self.program.is_swept:
+            return self._slopes_of(known, e.residual, e.unknowns), known.read(_nodes(e.residual))
         rows, residual = self.program.jacobians[index], e.residual
         places = [(i, j, node) for i, row in enumerate(rows) for j, node in row.items()]
         found = self._read(known, [*(node for _, _, node in places), *residual], index)
@@ -458,9 +455,13 @@ class StepsInNumbers:
 
     def _slopes_of(self, known: Values, nodes: list[int], inputs: list[int]) -> np.ndarray:
         """The derivatives of nodes by inputs, (states, nodes, inputs)."""
+        return known.slopes(nodes, inputs, self._plan(nodes, inputs))
+
+    def _plan(self, nodes: list[int], inputs: list[int]) -> Slopes:
+        """How they are found, made once."""
         if (key := (*nodes, -1, *inputs)) not in self._slopes:
             self._slopes[key] = Slopes(self.program.graph, nodes, inputs)
-        return known.slopes(nodes, inputs, self._slopes[key])
+        return self._slopes[key]
 
     def _read_each(self, known: Values, named: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """The values of arrays of nodes by their names, all at once."""

@@ -4,7 +4,6 @@ import functools
 import itertools
 import platform
 from collections.abc import Mapping
-from types import MappingProxyType
 from typing import Any
 
 import llvmlite
@@ -94,13 +93,13 @@ def _jit(block: int):
     return llvm.create_lljit_compiler(use_jit_link=True)
 
 
-def load(code: bytes, names: tuple[str, ...], known: Mapping[str, int] = MappingProxyType({})):
+def load(code: bytes, names: tuple[str, ...], known: Mapping[str, int] | None = None):
     """The object code linked into this process: a tracker that keeps it alive and gives addresses by name; `known` are those of
     other functions that it calls."""
     builder = llvm.JITLibraryBuilder().add_object_img(code).add_current_process()
     for name in names:
         builder.export_symbol(name)
-    for name, address in known.items():
+    for name, address in (known or {}).items():
         builder.import_symbol(name, address)
     number = next(_numbers)
     return builder.link(_jit(number // LINKED_TOGETHER), f"dirax_kernel_{number}")

@@ -3,7 +3,7 @@
 import contextlib
 import functools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -86,14 +86,13 @@ class ScalarProgram:
         first = len(self.graph)
         return np.array([self.graph.input(f"x{first + i}") for i in range(math.prod(shape))], np.int64).reshape(shape)
 
-    def depends_on(self, inputs: Nodes) -> bool:
+    def depends_on(self, *inputs: Nodes) -> bool:
         """Whether a result needs one of these inputs."""
-        flat = lambda arrays: [node for nodes in arrays for node in nodes.ravel().tolist()]
-        needed = set(self.graph.reachable(flat(self.results)))
+        needed = set(self.graph.reachable(_flat(self.results)))
         for step in reversed(self.opaque):
-            if not needed.isdisjoint(flat(step.results)):
-                needed.update(self.graph.reachable(flat(step.operands)))
-        return not needed.isdisjoint(flat([inputs]))
+            if not needed.isdisjoint(_flat(step.results)):
+                needed.update(self.graph.reachable(_flat(step.operands)))
+        return not needed.isdisjoint(_flat(inputs))
 
     def between(self, operands: list[Nodes], shapes: list[tuple[int, ...]], function: Callable, name: Any = None) -> list[Nodes]:
         """The nodes of the results of an opaque computation: of one with an equal `name` and the same operands those there are,
@@ -141,8 +140,7 @@ class ScalarProgram:
     @functools.cached_property
     def tape(self) -> Tape:
         """The program as a table for a compiled loop."""
-        flat = lambda arrays: [node for nodes in arrays for node in nodes.ravel().tolist()]
-        return Tape(self.graph, flat(self.inputs), flat(self.results), self.opaque)
+        return Tape(self.graph, _flat(self.inputs), _flat(self.results), self.opaque)
 
     def _part(self, leaves: list[np.ndarray], noise: Noise | None) -> list[np.ndarray]:
         known = Values(self.graph, len(leaves[0]), noise.table if noise else None)
@@ -158,11 +156,10 @@ class ScalarProgram:
     @functools.cached_property
     def _orders(self) -> list[Order]:
         """How to compute what is left for the operands of each opaque computation, and then for each result."""
-        flat = lambda arrays: [node for nodes in arrays for node in nodes.ravel().tolist()]
-        known, parts = set(flat(self.inputs)), []
+        known, parts = set(_flat(self.inputs)), []
         for step in self.opaque:
             parts += [self._next(nodes, known) for nodes in step.operands]
-            known.update(flat(step.results))
+            known.update(_flat(step.results))
         parts += [self._next(nodes, known) for nodes in self.results]
         return with_ends(self.graph, parts)
 
@@ -175,13 +172,12 @@ class ScalarProgram:
     @functools.cached_property
     def in_floats(self) -> Floats:
         """The results for one entry, as floats in order of floats in order."""
-        flat = lambda arrays: [node for nodes in arrays for node in nodes.ravel().tolist()]
-        return in_floats(self.graph, flat(self.inputs), flat(self.results), self.opaque)
+        return in_floats(self.graph, _flat(self.inputs), _flat(self.results), self.opaque)
 
     @functools.cached_property
     def in_jax(self) -> Callable[..., list[Any]]:
         """The program, without opaque computations, as a function of its arguments in JAX, operation by operation."""
-        outputs = [node for nodes in self.results for node in nodes.ravel().tolist()]
+        outputs = _flat(self.results)
         ends = np.cumsum([nodes.size for nodes in self.results])[:-1].tolist()
 
         @jax.jit
@@ -200,6 +196,10 @@ class ScalarProgram:
         graph = self.graph
         entries = [graph.value[node] if graph.is_constant(node) else np.nan for node in nodes.ravel().tolist()]
         return np.array(entries, dtype=float).reshape(nodes.shape)
+
+
+def _flat(arrays: Iterable[Nodes]) -> list[int]:
+    return [node for nodes in arrays for node in nodes.ravel().tolist()]
 
 
 _written: Memo[Callable] = Memo(128)

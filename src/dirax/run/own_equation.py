@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from dirax.numerics.arrays import is_whole
-from dirax.program.memo import Memo, Same
+from dirax.program.memo import Memo, Same, by_value
 from dirax.program.outside_values import package_of
 from dirax.program.user_functions import why_untraced
 from dirax.schemes.step import StepEquation
@@ -63,20 +63,21 @@ def refuse_wrong_shapes(system: Any, equation: Any, data: Mapping[str, Any], h: 
     """Raise `ValueError` where a function of a stage that is not dirax's own returns what its sizes and fields do not say, and
     where the energy of such a system is not one number; `data` are the complete ones of one trajectory."""
     if package_of(system) != "dirax":
-        _refuse_energies(system, equation, params)
+        _asked.get((by_value(system), Same(equation)), lambda: _ask_energy(system, equation, params))
     for stage, _ in equation.stages:
         if package_of(stage.residual) != "dirax":
             _asked.get(Same(stage), lambda stage=stage: _ask(stage, data, h, params))
 
 
-def _refuse_energies(system: Any, equation: Any, params: Any) -> None:
+def _ask_energy(system: Any, equation: Any, params: Any) -> bool:
     nodes = {name: jax.ShapeDtypeStruct(f.shape, np.float64) for name, f in equation.fields.items() if f.place == "node"}
     try:
         found = jax.eval_shape(system.energy_at, {**nodes, "t": jax.ShapeDtypeStruct((), np.float64)}, params)
     except Exception:  # it asks for what these rows do not hold, or is not there: nothing asks for it in a run
-        return
+        return True
     if np.shape(found) != ():
         raise ValueError(f"energy_at of {type(system).__name__} must return one number, but it returned {_said(found)}.")
+    return True
 
 
 def _ask(stage: StepEquation, data: Mapping[str, Any], h: Any, params: Any) -> bool:

@@ -236,11 +236,11 @@ def _with_slope(residual: ClosedJaxpr) -> tuple[Callable, Callable[[], At], int]
     if (sparse := _sparse(slope)) is not None:
         return value, lambda: _by_elimination(*sparse), LANES
     linear = ScalarProgram.of(slope, by_numpy=True)
-    if not any(map(linear.depends_on, linear.inputs)):
+    if not linear.depends_on(*linear.inputs):
         at = _least_changes(linear.in_numpy, CONSTANT)
         return value, lambda: at, LANES
-    fixed = FIXED if not linear.depends_on(linear.inputs[-1]) else MOVING
-    return value, lambda: _least_changes(linear.in_numpy, fixed), _together(linear.results[0].size)
+    kind = MOVING if linear.depends_on(linear.inputs[-1]) else FIXED
+    return value, lambda: _least_changes(linear.in_numpy, kind), _together(linear.results[0].size)
 
 
 CONSTANT, FIXED, MOVING = "constant", "fixed", "moving"

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 
 from dirax.engines.native.ir.emitter import Body, Emitter
 from dirax.engines.native.ir.lower import Region
+from dirax.engines.native.loops.dense import DENSE_NAME
 from dirax.engines.native.loops.plan import frontier
 from dirax.engines.newton_step import Correction
 from dirax.engines.stopping import CONTRACTING, FLOOR, NEAR, NEGLIGIBLE, OWN, STALLED
@@ -250,7 +251,7 @@ def by_partial_pivoting(
         for lane in range(e.width):
             with b.when(e.extract(weak, lane, e.bool)):
                 pointers = ", ".join(f"ptr {b.at('double', m, lane)}" for m in (entries, side, memory))
-                b.line(f"call void @dense_solve({pointers}, ptr {scratch}, i64 {k}, i64 {e.width})")
+                b.line(f"call void @{DENSE_NAME}({pointers}, ptr {scratch}, i64 {k}, i64 {e.width})")
     return [b.load(e.real, p) for p in slots(memory, k)]
 
 
