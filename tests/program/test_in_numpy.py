@@ -40,6 +40,13 @@ CASES = {
     "a loop of unknown length": lambda a, x: jax.lax.while_loop(
         lambda c: jnp.max(jnp.abs(c[0])) > 1e-3, lambda c: (c[0] / 3, c[1] + 1), (a @ x, 0)
     ),
+    "loops side by side, each of its own length": lambda a, x: jax.vmap(
+        lambda row: jax.vmap(
+            lambda most: jax.lax.while_loop(
+                lambda c: jnp.max(jnp.abs(c[0])) < most + 1.5, lambda c: (1.3 * c[0], c[1] + 1.0, c[2] @ a), (row, 0.0, a)
+            )
+        )(jnp.arange(4.0))
+    )(a),
     "entries in the order of Fortran": lambda a, x: (
         a.ravel(order="F") * jnp.arange(9.0),
         jax.grad(lambda a: jnp.sum((a @ a).reshape((9,), order="F") ** 3 * jnp.arange(9.0)))(a),

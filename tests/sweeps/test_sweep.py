@@ -226,10 +226,13 @@ def test_the_same_call_again_runs_what_is_missing(done, tmp_path, ran):
 
 def test_more_points_are_added_and_those_that_are_there_not_run_again(done, tmp_path, ran):
     path = tmp_path / "study.zarr"
-    study(path, {"g": OVER["g"][::2], "angle": OVER["angle"][1::3]})
-    there = sum(ran)
+    kept, older = (study(path, {"g": OVER["g"][::2], "angle": OVER["angle"][1::3]}) for _ in range(2))
+    there, q = sum(ran), kept.load().q.values
     assert same(study(path), done[0])
     assert sum(ran) == 240 and there == 6 * 7
+    assert np.array_equal(kept.q.values, q)
+    with pytest.raises(RuntimeError, match="has grown since"):
+        _ = older.q.values
     with pytest.raises(ValueError, match="leave out none"):
         study(path, {"g": OVER["g"][:3], "angle": OVER["angle"]})
 

@@ -51,10 +51,12 @@ def attributes_of(path: Path) -> dict[str, Any]:
 def opened(path: Path) -> "Dataset":
     """The store as a Dataset whose arrays are read when they are used, as arrays of dask where that is installed.
 
-    Raises `ValueError` for one that a later dirax wrote."""
+    Raises `ValueError` for one that a later dirax wrote; the arrays raise `StoreReplaced` once another is in its place."""
     import xarray as xr
+
+    from dirax.solution.same_store import SameStore  # imported when it is used
 
     attributes_of(path)
     for node in path.glob(f"*/{NODE}"):
         plain_bytes(node, node.relative_to(path), LONGEST_NODE)
-    return xr.open_zarr(path, chunks={} if find_spec("dask") else None)  # type: ignore[arg-type]
+    return xr.open_zarr(SameStore(path), chunks={} if find_spec("dask") else None)  # type: ignore[arg-type]

@@ -152,8 +152,9 @@ def while_(made: ScalarProgram, interpreter: Interpreter, equation: Any, *operan
             going = condition([*for_condition, *carry])[0] != 0
             if not np.any(going):
                 return carry
-            after = body([*for_body, *carry])
-            carry = [np.where(going.reshape(-1, *(1,) * (x.ndim - 1)), x, y) for x, y in zip(after, carry, strict=True)]
+            after = body([*for_body, *carry])  # under vmap each of its entries has a condition of its own, in front
+            here = lambda a, going=going: going.reshape(*going.shape, *(1,) * (a.ndim - going.ndim))
+            carry = [np.where(here(x), x, y) for x, y in zip(after, carry, strict=True)]
 
     return made.between(list(operands), [v.aval.shape for v in equation.outvars], loop)
 
