@@ -34,6 +34,23 @@ def test_indices_and_truth_values(engine):
     np.testing.assert_allclose(np.ptp(sol.energy(), axis=1), 0.0, atol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("number", "stiffness"),
+    [
+        (np.int32(2**30), lambda p: jnp.asarray(p * 4 + 2, float)),  # it wraps around
+        (np.array([1, 255], np.uint8), lambda p: jnp.asarray(p[0] - p[1], float)),
+        (2**53 + 1, lambda p: 2.0 * jnp.asarray(p - 2**53, float)),  # no float64
+        (10**9, lambda p: jnp.asarray(p, float) * 2e-9),
+    ],
+)
+@pytest.mark.parametrize("engine", ["xla", "native"])
+def test_whole_numbers_of_any_size_are_those_of_jax(number, stiffness, engine):
+    run = {"q": np.ones(1), "v": np.zeros(1), "step": 0.1, "steps": 30, "engine": engine}
+    sol = dx.simulate(oscillator(stiffness), MIDPOINT, params=number, **run)
+    np.testing.assert_allclose(sol.q[-1, 0], cayley(2.0, 0.1, 30), atol=1e-13)
+    np.testing.assert_allclose(sol.energy(), 1.0, atol=1e-13)
+
+
 @pytest.mark.parametrize("engine", ["xla", "auto"])
 def test_a_table_read_where_the_params_are_captured(engine):
     """sol.params can be closed over and read by an index that JAX traces, as can what a failed step is explained from."""

@@ -272,6 +272,13 @@ def test_the_store_of_another_sweep_is_refused_with_what_differs(done):
     assert renamed(1.0, 2.0) == case(1.0, 2.0)
 
 
+def test_whole_numbers_that_became_fractions_are_said_to_be_what_differs(tmp_path):
+    path = tmp_path / "whole.zarr"
+    study(path, {"g": [1.0], "angle": [1, 2]}, case=lambda g, angle: case(g, angle + 0.5))
+    with pytest.raises(ValueError, match=r"differs in the type of the values of angle \(int64 there, float64 here\)"):
+        study(path, {"g": [1.0], "angle": [1, 1.5, 2]}, case=lambda g, angle: case(g, angle + 0.5))
+
+
 def test_a_later_dirax_and_other_stores_are_refused(done, tmp_path):
     path = tmp_path / "study.zarr"
     study(path, {"g": [1.0], "angle": [0.5]})
@@ -515,6 +522,31 @@ def test_functions_that_cannot_be_sent_to_other_processes_are_one_error(tmp_path
 def test_numbers_of_types_that_stores_do_not_hold_are_kept_in_wider_ones(kept, tmp_path):
     data = study(tmp_path / "small.zarr", {"g": [1.0], "angle": [0.5, 1.0]}, keep=lambda sol: {"x": kept})
     assert np.all(data.x == kept) and data.x.dtype.name in TYPES
+
+
+def test_numbers_of_several_types_are_kept_and_given_in_one_that_has_them_all(tmp_path):
+    angles = np.linspace(0.5, 2.0, 6)
+    grid = {"g": [1.0], "angle": angles}
+    late = lambda sol: {"x": sol.q[0, 0] if sol.q[0, 0] > 1.0 else 0, "n": 3 if sol.q[0, 0] > 1.0 else np.int8(1)}
+    data = study(tmp_path / "kept.zarr", grid, keep=late)
+    assert np.array_equal(data.x.values[0], np.where(angles > 1.0, angles, 0.0))
+    assert np.array_equal(data.n.values[0], np.where(angles > 1.0, 3, 1))
+    chosen = lambda g, angle: case(g, angle) | {"params": {"g": 1.0 if angle < 1.0 else 1.5, "n": 1 if angle < 1.0 else 0.5}}
+    data = study(tmp_path / "given.zarr", grid, case=chosen)
+    for j in (0, 5):
+        assert np.array_equal(data.q.values[0, j], single([1.0, 1.5][j > 0], angles[j]).q)
+
+
+def test_a_type_that_does_not_have_a_later_number_is_one_error(tmp_path):
+    many = {"g": np.linspace(1.0, 2.0, 1000), "angle": [0.5]}
+    odd = lambda g: 0.3 < (g - 1.0) * 999.0 - 500.0 < 1.3
+    with pytest.raises(ValueError, match=r"one type at all points, but at g = 1\.501.* its params\['n'\] is 1\.5, which int64"):
+        study(
+            tmp_path / "given.zarr", many, case=lambda g, angle: case(g, angle) | {"params": {"g": g, "n": 1.5 if odd(g) else 1}}
+        )
+    kept = lambda sol: {"x": sol.t[-1] + 0.5 if odd(float(sol.params["g"])) else 0}
+    with pytest.raises(ValueError, match=r"keep must return x in one type .*at g = 1\.501.*0\.0 in place of 0"):
+        study(tmp_path / "kept.zarr", many, keep=kept)
 
 
 def test_a_wrong_keep_is_one_error(tmp_path):

@@ -1,5 +1,5 @@
-"""The arrays that signatures name: of NumPy where the numbers are known, of JAX where they are traced; whether two agree, and
-whether a value is a whole number."""
+"""The arrays that signatures name: of NumPy where the numbers are known, of JAX where they are traced; whether two agree, whether
+a type has the numbers of one, and whether a value is a whole number."""
 
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -24,6 +24,15 @@ def agree(a: np.ndarray, b: np.ndarray, tolerance: float, axis: int | None = Non
     `axis`, whatever units that is in. Entries that are not finite must be the same."""
     largest = np.max(np.abs(b), axis=axis, keepdims=True, initial=0.0, where=np.isfinite(b))
     return a.shape == b.shape and np.allclose(a, b, rtol=0.0, atol=tolerance * largest, equal_nan=True)
+
+
+def as_type(array: np.ndarray, dtype: np.dtype) -> np.ndarray | None:
+    """The same numbers in another type; None where that does not have all of them."""
+    if np.can_cast(array.dtype, dtype, "safe"):
+        return array.astype(dtype)
+    with np.errstate(all="ignore"):
+        found = array.astype(dtype)
+    return found if np.array_equal(found, array, equal_nan=array.dtype.kind == dtype.kind == "f") else None
 
 
 def is_whole(value: Any) -> bool:

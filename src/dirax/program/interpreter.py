@@ -10,7 +10,7 @@ from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Literal
 
 from dirax.program.graph import Graph
-from dirax.program.whole_numbers import EXACT, Ranges
+from dirax.program.whole_numbers import Ranges, are_floats
 
 Nodes = np.ndarray
 """An integer array of node numbers, in the shape of the array that it stands for."""
@@ -100,6 +100,10 @@ class Interpreter:
             failure = UnsupportedPrimitive("constant", f"has dtype {dtype}", "a captured array")
             return Held(value, failure) if known else Unavailable(failure)
         array = np.asarray(value)
+        if array.dtype.kind in "iu" and not are_floats(array):
+            return Held(
+                value, UnsupportedPrimitive("constant", "is a whole number that float64 does not hold", "a captured array")
+            )
         numbers = array.ravel().tolist()
         if array.dtype != np.float64 or len(numbers) < MANY:
             return np.array(list(map(self.graph.constant, numbers)), dtype=np.int64).reshape(array.shape)
@@ -154,12 +158,11 @@ class Interpreter:
         return [self._of_known(value, equation) for value in results]
 
     def _of_known(self, value: Any, equation: Any) -> Nodes | Unavailable:
-        """The nodes of a concrete array, which is held where it is of whole numbers that they do not hold."""
-        if is_held_by_nodes(value.dtype) and not (
-            value.dtype.kind in "iu" and np.any(np.abs(np.asarray(value).astype(float)) > EXACT)
-        ):
-            return self.constants(value)
-        return Held(value, self._failure(equation.primitive.name, "has a result that float64 does not hold"))
+        """The nodes of a concrete array, which is held where they do not hold it."""
+        found = self.constants(value)
+        if isinstance(found, Held):
+            return Held(value, self._failure(equation.primitive.name, "has a result that float64 does not hold"))
+        return found
 
     def _failure(self, name: str, reason: str) -> UnsupportedPrimitive:
         # equations inside a library's jitted functions have no line of the user's: the calling equation has it

@@ -18,7 +18,7 @@ from dirax.program.evaluation.in_numpy import LANES, Values, in_parts
 from dirax.program.evaluation.noise import Noise
 from dirax.program.evaluation.tape import FEWEST_NODES, Tape
 from dirax.program.graph import NODE_LIMIT, Graph, GraphTooLarge, Order, with_ends
-from dirax.program.interpreter import Interpreter, Nodes, Unavailable, UnsupportedPrimitive, elementwise
+from dirax.program.interpreter import Interpreter, Nodes, Unavailable, UnsupportedPrimitive, elementwise, is_integer
 from dirax.program.memo import Memo, Same
 from dirax.program.primitives import plain_primitive
 
@@ -76,7 +76,11 @@ class ScalarProgram:
 
     def run(self, jaxpr: ClosedJaxpr, rules: Mapping[str, Callable] | None = None) -> None:
         """Find the results, the nodes of `jaxpr` of the inputs. Raises as `of`."""
-        self.results = Interpreter(self.graph, rules).run(jaxpr, *self.inputs)
+        interpreter = Interpreter(self.graph, rules)
+        for variable, nodes in zip(jaxpr.jaxpr.invars, self.inputs, strict=True):
+            if is_integer(variable):
+                interpreter.ranges.given(nodes, variable.aval.dtype)
+        self.results = interpreter.run(jaxpr, *self.inputs)
         for result in self.results:
             if isinstance(result, Unavailable):
                 raise result.error

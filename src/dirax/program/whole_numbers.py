@@ -15,12 +15,25 @@ FROM_FLOATS = 2.0**26
 Range = tuple[float, float]
 
 
+def are_floats(numbers: np.ndarray) -> bool:
+    """Whether floats have all of these whole numbers; the limits of their type, which bound others, need not be exact."""
+    limits, flat = np.iinfo(numbers.dtype), numbers.ravel()
+    large = flat[(flat >= EXACT) | (flat <= -EXACT)].tolist()
+    return all(int(float(x)) == x or x in (limits.min, limits.max) for x in large)
+
+
 class Ranges:
     """The least and the largest value of nodes that are whole numbers."""
 
     def __init__(self, graph: Graph):
         self.graph = graph
         self._known: dict[int, Range] = {}
+
+    def given(self, nodes: np.ndarray, dtype: np.dtype) -> None:
+        """Note that nodes are any numbers of a type; those of 64 bits, such as Python's own, are taken for those of floats."""
+        if np.iinfo(dtype).bits < 64:
+            for node in nodes.ravel().tolist():
+                self._within(node, dtype)
 
     def wrapped(self, node: int, dtype: np.dtype) -> int | None:
         """A whole number in a type: as it is where it cannot leave it, else modulo the size of the type; None where floats do not

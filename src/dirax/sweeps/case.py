@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.numerics.arrays import agree
+from dirax.numerics.arrays import agree, as_type
 from dirax.program.memo import Memo, Same
 from dirax.run.params import arrays_of_params, register_dataclasses
 from dirax.sweeps.axes import PointError, described, identities
@@ -72,12 +72,12 @@ class Case:
     def chosen(self, values: Values) -> "Case":
         """The same with the fastest way that agrees with single calls at these points. Raises `PointError`."""
         ones = [self._one(values, number) for number in range(_size(values))]
-        settled = replace(self, like=ones[0])
-        _stacked(ones, values)  # of one form
+        each = _stacked(ones, values)
+        settled = replace(self, like=jax.tree.map(lambda leaf: leaf[0], each))
         for mode in ("scalars", "jax", "columns"):
             if mode == "jax" and "key" not in self.names:
                 continue  # what is not random and has no scalar program is compiled in every worker: columns are tried first
-            if _same(replace(settled, mode=mode)._tried(values), _stacked(ones, values)):
+            if _same(replace(settled, mode=mode)._tried(values), each):
                 return replace(settled, mode=mode)
         again = self._one(values, 0)
         if not _same(_stacked([again], values), _stacked(ones[:1], values)):
@@ -142,7 +142,8 @@ class Case:
             return None
         if found is None or jax.tree.structure(found) != jax.tree.structure(self.like):
             return None
-        return jax.tree.map(lambda like, leaf: np.asarray(leaf).astype(like.dtype), self.like, found)
+        typed = jax.tree.map(lambda like, leaf: as_type(np.asarray(leaf), like.dtype), self.like, found)
+        return typed if jax.tree.structure(typed) == jax.tree.structure(self.like) else None  # None is no leaf
 
     def _scalars(self, values: Values) -> Any:
         from dirax.program.evaluation.functions import in_numpy  # imported when it is used
@@ -216,7 +217,12 @@ def _normal(found: Any, xp: Any) -> dict[str, Any]:
 
 def _stacked(ones: list[dict[str, Any]], values: Values, like: Any = None) -> dict[str, Any]:
     """Values at single points as one, with an axis in front."""
-    first = ones[0] if like is None else like
+    if like is None:
+        first = ones[0]
+        if all(jax.tree.structure(one) == jax.tree.structure(first) for one in ones):
+            first = jax.tree.map(lambda leaf, *others: leaf.astype(np.result_type(leaf, *others)), *ones)
+    else:
+        first = like
     form = lambda one: (jax.tree.structure(one), [leaf.shape for leaf in jax.tree.leaves(one)])
     wanted = form(first)
     for number, one in enumerate(ones):
@@ -225,7 +231,16 @@ def _stacked(ones: list[dict[str, Any]], values: Values, like: Any = None) -> di
                 f"case must return data of one form at all points, but at {described(values, number)} it returned "
                 f"{_shapes(one)}, and {_shapes(first)} elsewhere."
             )
-    return jax.tree.map(lambda like, *leaves: np.stack(leaves).astype(like.dtype), first, *ones)
+    typed = [jax.tree.map(lambda like, leaf: as_type(leaf, like.dtype), first, one) for one in ones]
+    for number, one in enumerate(typed):
+        if jax.tree.structure(one) != jax.tree.structure(first):
+            pairs = zip(jax.tree_util.tree_leaves_with_path(ones[number]), jax.tree.leaves(first), strict=True)
+            path, leaf, dtype = next((p, leaf, to.dtype) for (p, leaf), to in pairs if as_type(leaf, to.dtype) is None)
+            raise PointError(
+                f"case must return data of one type at all points, but at {described(values, number)} its {_place(path)} is "
+                f"{leaf}, which {dtype}, the type elsewhere, does not have: let it return floats, 1.0 in place of 1."
+            )
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *typed)
 
 
 def _shapes(one: Any) -> str:

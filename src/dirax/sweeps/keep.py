@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.numerics.arrays import agree
+from dirax.numerics.arrays import agree, as_type
 from dirax.program.memo import Memo, Same
 from dirax.solution.description import layout_of
 from dirax.solution.solution import Solution
@@ -64,7 +64,10 @@ class Keep:
         first = self._of_one(sol, 0, values)
         settled = replace(self, like=first, derived=self._asked_for(sol))
         settled = replace(settled, quick="energy" in settled.derived and is_quick(sol))
-        each = settled.at(sol, values)
+        ones = settled._each(sol, values)
+        wide = {name: np.result_type(like, *(one[name] for one in ones if name in one)) for name, like in first.items()}
+        settled = replace(settled, like={name: like.astype(wide[name]) for name, like in first.items()})
+        each = settled._stacked(sol, ones, values)
         modes: tuple[Mode, ...] = ("batch", "columns", "jax")
         for mode in modes:
             tried = replace(settled, mode=mode)
@@ -80,12 +83,11 @@ class Keep:
         """What is kept of a batch, arrays (B, …) by name. Raises `PointError`."""
         if self.mode == "rows":
             return {entry["variable"]: np.asarray(sol.fields[entry["name"]]) for entry in layout_of(sol.field_info)}
-        size = sol.batch or 0
+        if self.mode == "singles":
+            return self._stacked(sol, self._each(sol, values), values)
         if self.quick:
             sol.derived["energy"] = energy_of(sol)
-        if self.mode == "singles":
-            return self._stacked(sol, [self._of_one(sol, lane, values) for lane in range(size)], values)
-        most = lanes_together(sol.rows)
+        size, most = sol.batch or 0, lanes_together(sol.rows)
         parts = []
         for low in range(0, size, most):
             try:
@@ -94,10 +96,10 @@ class Keep:
                 raise PointError(
                     f"keep fails for the trajectories from {described(values, low)} on: {in_words(error)}"
                 ) from error
-        found = {name: np.concatenate([part[name] for part in parts]).astype(like.dtype) for name, like in self.like.items()}
-        if any(found[name].shape != (size, *like.shape) for name, like in self.like.items()):  # `q[:10]` of at most ten
+        found = {name: as_type(np.concatenate([part[name] for part in parts]), like.dtype) for name, like in self.like.items()}
+        if any(a is None or a.shape != (size, *self.like[name].shape) for name, a in found.items()):  # `q[:10]` of at most ten
             return replace(self, mode="singles").at(sol, values)
-        return found
+        return found  # type: ignore[return-value]
 
     # ------------------------------------------------------------------ many at once
 
@@ -130,6 +132,11 @@ class Keep:
 
     # ------------------------------------------------------------------ one by one
 
+    def _each(self, sol: Solution, values: Values) -> list[dict[str, np.ndarray]]:
+        if self.quick:
+            sol.derived["energy"] = energy_of(sol)
+        return [self._of_one(sol, lane, values) for lane in range(sol.batch or 0)]
+
     def _of_one(self, sol: Solution, lane: int, values: Values) -> dict[str, np.ndarray]:
         try:
             found = self.function(single(sol, lane))  # type: ignore[misc]
@@ -149,16 +156,23 @@ class Keep:
 
     def _stacked(self, sol: Solution, ones: list[dict[str, np.ndarray]], values: Values) -> dict[str, np.ndarray]:
         form = lambda one: {name: array.shape for name, array in one.items()}
+        typed: list[Any] = []
         for lane, one in enumerate(ones):
-            if form(one) == form(self.like):
-                continue
-            if np.asarray(sol.ok)[lane]:
+            found = {name: as_type(one[name], like.dtype) for name, like in self.like.items() if name in one}
+            same, other = form(one) == form(self.like), next((name for name, array in found.items() if array is None), None)
+            if np.asarray(sol.ok)[lane] and not same:
                 raise PointError(
                     f"keep must return arrays of one shape for all trajectories, but at {described(values, lane)} it returned "
                     f"{form(one)}, and {form(self.like)} elsewhere."
                 )
-            ones[lane] = {name: _nothing(like) for name, like in self.like.items()}
-        return {name: np.stack([one[name] for one in ones]).astype(like.dtype) for name, like in self.like.items()}
+            if np.asarray(sol.ok)[lane] and other is not None:
+                raise PointError(
+                    f"keep must return {other} in one type for all trajectories, but at {described(values, lane)} it returned "
+                    f"{one[other]}, which {self.like[other].dtype}, the type elsewhere, does not have: let it return floats, 0.0 "
+                    "in place of 0."
+                )
+            typed.append(found if same and other is None else {name: _nothing(like) for name, like in self.like.items()})
+        return {name: np.stack([one[name] for one in typed]) for name in self.like}
 
     def _asked_for(self, sol: Solution) -> tuple[str, ...]:
         """The derived quantities that a call for one trajectory computes."""
@@ -241,4 +255,4 @@ def _nothing(like: np.ndarray) -> np.ndarray:
 
 
 def _close(a: np.ndarray, b: np.ndarray) -> bool:
-    return a.dtype.kind == b.dtype.kind and agree(a, b, SAME)
+    return a.dtype.kind == b.dtype.kind and np.can_cast(a.dtype, b.dtype, "safe") and agree(a, b, SAME)

@@ -73,6 +73,9 @@ def _compared(path: Path, axes: Axes, marks: dict[str, Any]) -> tuple[np.ndarray
             "another path for to=, or pass overwrite=True to begin anew."
         )
     found = fingerprint.differences(json.loads(there["fingerprint"]), marks)
+    kinds = {name: (old.values[name].dtype, values.dtype) for name, values in axes.values.items() if name in old.values}
+    if found and (other := [f"{name} ({was} there, {now} here)" for name, (was, now) in kinds.items() if was.kind != now.kind]):
+        found = [f"the type of the values of {', '.join(other)}"]
     if found:
         raise ValueError(
             f"{path} belongs to another sweep, which differs in {'; '.join(found)}: choose another path for to=, or pass "
