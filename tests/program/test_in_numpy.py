@@ -100,7 +100,9 @@ def test_one_entry_again_and_again_has_the_same_bits(name, monkeypatch):
 
 
 def test_what_has_no_rule_is_left_to_the_compiler():
-    x = np.ones((2, 3))
+    x, z = np.ones((2, 3)), np.array([3 + 4j, 1j])
+    assert in_numpy(jnp.abs, [z], "a size") is None and in_numpy(jnp.sin, [x], "a sine") is not None
+    np.testing.assert_array_equal(in_numpy(lambda z: jnp.ones(()), [z], "none of it"), [1.0, 1.0])
     assert in_numpy(jnp.sort, [x], "sort") is None
     assert jax.jit(lambda y: jnp.zeros(()) if in_numpy(lambda x: x * y, [x], "captured") is None else y)(2.0) == 0.0
 

@@ -76,11 +76,13 @@ class ScalarProgram:
 
     def run(self, jaxpr: ClosedJaxpr, rules: Mapping[str, Callable] | None = None) -> None:
         """Find the results, the nodes of `jaxpr` of the inputs. Raises as `of`."""
-        interpreter = Interpreter(self.graph, rules)
+        interpreter, given = Interpreter(self.graph, rules), []
         for variable, nodes in zip(jaxpr.jaxpr.invars, self.inputs, strict=True):
             if is_integer(variable):
                 interpreter.ranges.given(nodes, variable.aval.dtype)
-        self.results = interpreter.run(jaxpr, *self.inputs)
+            is_complex = jnp.issubdtype(variable.aval.dtype, np.complexfloating)
+            given.append(Unavailable(UnsupportedPrimitive("argument", "is complex", "its caller")) if is_complex else nodes)
+        self.results = interpreter.run(jaxpr, *given)
         for result in self.results:
             if isinstance(result, Unavailable):
                 raise result.error
@@ -114,6 +116,7 @@ class ScalarProgram:
         """The results for arguments (entries, …), with that leading axis; for one entry again and again by Python's floats, which
         have the same bits. `noise`: of the operations, in place of NumPy's; opaque computations have that of their operands."""
         self._asked += 1
+        leaves = [leaf.real if leaf.dtype.kind == "c" else leaf for leaf in leaves]  # of complex numbers nothing is read
         if noise is None and self.tape_pays(len(leaves[0])):
             return self._by_tape(leaves)
         if len(leaves[0]) == 1 and noise is None and self._asked > OFTEN:
