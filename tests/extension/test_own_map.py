@@ -70,6 +70,27 @@ def test_a_map_that_is_none_is_refused(system, start):
     assert "derivative_defect=0.5" in repr(dx.check_discretization_map(Stretched(1.0), np.ones(2), np.ones(2)))
 
 
+class OneVector(Stretched):
+    def backward(self, x0, x1):
+        return x1 - x0
+
+
+class Short(Stretched):
+    def forward(self, x, v):
+        return (x - v / 2)[:-1], x + v / 2
+
+
+@pytest.mark.parametrize(("system", "start"), OSCILLATORS)
+def test_a_map_of_other_shapes_is_refused(system, start):
+    for scheme in (dx.DiscreteDirac(OneVector(0.5)), dx.DiscreteDirac(OneVector(0.5), constraints="resolve")):
+        with pytest.raises(ValueError, match=r"OneVector\.backward\(x0, x1\) must return x and v, .*returned one of shape"):
+            dx.simulate(system, scheme, **start, step=0.1, steps=9)
+    with pytest.raises(
+        ValueError, match=r"Short\.forward\(x, v\) must return two points, .*\(2,\), but it returned \[\(1,\), \(2,\)"
+    ):
+        dx.check_discretization_map(Short(0.5), np.ones(2), np.ones(2))
+
+
 def rate_of(steps_and_errors):
     steps, errors = map(np.asarray, zip(*steps_and_errors, strict=True))
     return -np.diff(np.log(errors), axis=0).T / np.diff(np.log(steps))

@@ -34,18 +34,34 @@ class DiscretizationMapReport(eqx.Module):
 
 def check_discretization_map(map: AbstractDiscretizationMap, x: ArrayLike, v: ArrayLike) -> DiscretizationMapReport:
     """How far (D1), (D2) and invertibility ([BLM] Definition 4.5, Proposition 4.6) fail at the tangent vector v at x. Raises
-    `ValueError` for a point and a vector of different shapes."""
+    `ValueError` for a point and a vector of different shapes, and for a map that returns others."""
     x, v = jnp.asarray(x, dtype=float), jnp.asarray(v, dtype=float)
     if x.ndim != 1 or x.shape != v.shape:
         raise ValueError(
             f"x and v must have one shape (N,), a point and a tangent vector at it, but have {x.shape} and {v.shape}."
         )
+    refuse_other_shapes(map, x.shape[0])
     return jax.tree.map(jnp.asarray, evaluated(once(_report, map, True), x, v))
 
 
 def defects_at(map: AbstractDiscretizationMap, x: ArrayLike) -> DiscretizationMapReport:
     """The same at the zero vector, in numbers; a root that is searched for is none but the inverse."""
     return evaluated(once(_report, map, map.has_explicit_inverse), x, np.zeros_like(x))
+
+
+def refuse_other_shapes(map: AbstractDiscretizationMap, size: int) -> None:
+    """Raise `ValueError` for a map of one's own that does not return two vectors of the `size` of those that it is given."""
+    if map.is_known:
+        return
+    vector = jax.ShapeDtypeStruct((size,), np.float64)
+    for function, what in ((map.forward, "(x, v) must return two points"), (map.backward, "(x0, x1) must return x and v")):
+        found = jax.eval_shape(function, vector, vector)
+        shapes = [getattr(one, "shape", None) for one in found] if isinstance(found, tuple | list) else None
+        if shapes != [(size,)] * 2:
+            came = f"one of shape {found.shape}" if hasattr(found, "shape") else f"{found}" if shapes is None else f"{shapes}"
+            raise ValueError(
+                f"{type(map).__name__}.{function.__name__}{what}, two vectors of shape ({size},), but it returned {came}."
+            )
 
 
 def _report(map: AbstractDiscretizationMap, inverse: bool, x: Vector, v: Vector) -> DiscretizationMapReport:

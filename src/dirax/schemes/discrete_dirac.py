@@ -83,7 +83,7 @@ class DiscreteDirac(AbstractScheme):
                 "PortHamiltonian, ImplicitSystem, LagrangeDirac, NonholonomicMechanics and PhaseSpaceLagrangian systems, but a "
                 f"{type(system).__name__} was given."
             )
-        return by_a_discretization_map(self.map, equation, system.relation_form(shape) is not None)
+        return by_a_discretization_map(self.map, equation, system.relation_form(shape) is not None, shape.n)
 
     def _discretized(self, system: AbstractSystem, shape: Shape) -> StepEquation | None:
         """Method 1."""

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.geometry.cotangent_lift import CotangentLift
-from dirax.geometry.map_report import defects_at
+from dirax.geometry.map_report import defects_at, refuse_other_shapes
 from dirax.geometry.maps import AbstractDiscretizationMap
 from dirax.schemes.step import StepEquation
 
@@ -14,11 +14,13 @@ KEPT = 1e-6
 """How far (D1), relative to the point, (D2) and the inverse may fail."""
 
 
-def by_a_discretization_map(map: AbstractDiscretizationMap, equation: StepEquation, of_relation: bool) -> StepEquation:
-    """The equation of steps by a map on the points of a relation form, or on Q, which refuses initial data where the map is not
-    known to be one and is none."""
+def by_a_discretization_map(map: AbstractDiscretizationMap, equation: StepEquation, of_relation: bool, size: int) -> StepEquation:
+    """The equation of steps by a map on the points of a relation form, or on Q, of this size, which refuses initial data where
+    the map is not known to be one and is none. Raises `ValueError` for one that returns no such points."""
     if map.is_known:
         return equation
+    lifted = isinstance(map, CotangentLift)
+    refuse_other_shapes(map.map if lifted else map, size // 2 if lifted and of_relation else size)
 
     def check(data, h, params):
         equation.check(data, h, params)
