@@ -128,6 +128,9 @@ def test_files_and_longer_runs(sol, tmp_path):
         loaded = dx.load(tmp_path / f"batch{ending}", system=EXAMPLE.system, scheme=SCHEME)
         assert np.array_equal(loaded.t, batch.t) and dx.verify(loaded).ok
     assert np.array_equal(batch.to_dataframe()["t"].to_numpy(), batch.t.ravel())
+    assert "time" not in batch.to_xarray().coords and np.array_equal(batch.to_xarray().clock, batch.t)
+    assert np.array_equal(sol.to_xarray().time, sol.t)
+    assert np.array_equal(sol.to_xarray().q.sel(time=sol.t[20]), sol.q[20])
     longer = batch.extend(5)
     assert np.array_equal(longer.q[:, :31], batch.q) and longer.t.shape == (2, 36)
     thin = dx.simulate(EXAMPLE.system, SCHEME, step=0.1, steps=30, save_every=7, **RUN)

@@ -224,6 +224,26 @@ def test_the_same_call_again_runs_what_is_missing(done, tmp_path, ran):
     assert same(study(path), done[0]) and first < sum(ran) < 2 * first
 
 
+def test_finished_points_whose_numbers_are_gone_are_not_taken_for_nan(done, tmp_path):
+    path = tmp_path / "study.zarr"
+    data = study(path)
+    gone = sorted(path.glob("q/c.*"))[1]
+    gone.unlink()
+    with pytest.raises(RuntimeError, match=r"q/c[.0-9]+ is gone, .*: delete .*status/c[.0-9]+, and the same call"):
+        _ = data.q.values
+    (path / "status" / ".".join(gone.name.split(".")[:3])).unlink()
+    assert np.sum(np.isnan(dx.load(path).q.values)) > 0
+    assert same(study(path), done[0])
+
+
+def test_steps_of_variable_length_have_no_times_in_common(tmp_path):
+    oscillator = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q / 2)
+    run = {"case": lambda a: {"q": [a], "v": [0.0]}, "step": 0.1, "steps": 4}
+    scheme = dx.VariableSteps(dx.Collocation(1), lambda q: 1.0 + q @ q)
+    data = dx.sweep(oscillator, scheme, over={"a": [1.0, 2.0]}, to=tmp_path / "variable.zarr", **run)
+    assert "time" not in data.coords and np.all(np.diff(data.clock) < np.array([[0.06], [0.03]]))
+
+
 def test_more_points_are_added_and_those_that_are_there_not_run_again(done, tmp_path, ran):
     path = tmp_path / "study.zarr"
     kept, older = (study(path, {"g": OVER["g"][::2], "angle": OVER["angle"][1::3]}) for _ in range(2))

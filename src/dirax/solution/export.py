@@ -9,12 +9,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dirax.solution.atomic_files import placed
-from dirax.solution.description import describe
+from dirax.solution.description import Variable, describe
 from dirax.solution.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from pandas import DataFrame
     from xarray import Dataset
+
+ROWS = {"time", "interval"}
+"""The axes of rows, and of the steps that leave them."""
 
 BLOCK = 2**14
 """Rows of a CSV file that are written at a time."""
@@ -24,7 +27,8 @@ def to_xarray(sol: Trajectory, units: Mapping[str, Any] | None = None, coordinat
     """The solution as an `xarray.Dataset` with named dimensions, units, derived quantities and what was run.
 
     Dimensions: `trajectory` (in a batch), `time` (saved rows), `interval` (the step leaving a row), `coordinate`,
-    `constraint`. Variables: every saved field, `energy`, `constraint_residual`, the initial data, and `ok` in a batch.
+    `constraint`. Variables: every saved field, `energy`, `constraint_residual`, the initial data, and `ok` in a batch. With
+    variable steps the trajectories of a batch have times of their own, `clock`, and `time` no values.
     `units`: a unit for "t", "energy" or the name of a field, one string or one per coordinate: {"t": "s", "q": ["m", "rad"]};
     `coordinates`: the names of the coordinates. Both default to what `sol.metadata` says.
     A table with one row a time is `sol.to_dataframe()`: `Dataset.to_dataframe()` has one for every combination of all
@@ -36,7 +40,22 @@ def to_xarray(sol: Trajectory, units: Mapping[str, Any] | None = None, coordinat
 
     said = describe(sol, units, coordinates)
     as_xarray = lambda variables: {name: (v.dims, v.values, v.about) for name, v in variables.items()}
-    return xr.Dataset(as_xarray(said.variables), as_xarray(said.axes), said.attributes)
+    return xr.Dataset(as_xarray(said.variables), as_xarray(axes_in_time(sol, said.axes)), said.attributes)
+
+
+def axes_in_time(sol: Trajectory, axes: Mapping[str, Variable]) -> dict[str, Variable]:
+    """The axes with the times of the rows, which number the steps of a run with variable ones otherwise; without them where every
+    trajectory has its own."""
+    if not sol.has_own_times:
+        return dict(axes)
+    found = {name: axis for name, axis in axes.items() if name not in ROWS}
+    if sol.batch is None:
+        t = np.asarray(sol.t)
+        found |= {
+            n: Variable(axes[n].dims, t[: len(axes[n].values)], {**axes[n].about, "long_name": "time"})
+            for n in ROWS & axes.keys()
+        }
+    return found
 
 
 def to_dataframe(sol: Trajectory, coordinates: Sequence[str] | None = None) -> "DataFrame":
@@ -87,7 +106,7 @@ def _columns(sol: Trajectory, coordinates: Sequence[str] | None) -> dict[str, np
     lead = 1 if sol.batch is None else 2
     for field, variable in said.variables.items():
         inner = variable.dims[lead:]
-        if variable.dims[lead - 1 : lead] not in (("time",), ("interval",)):
+        if not ROWS.intersection(variable.dims[lead - 1 : lead]):
             continue  # initial data and ok belong to no row
         values = np.asarray(variable.values, dtype=float).reshape(count, -1, int(np.prod(variable.values.shape[lead:])))
         if variable.dims[lead - 1] == "interval":

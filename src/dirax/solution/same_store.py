@@ -1,10 +1,12 @@
 """The store of a sweep, read from while nobody else has put another one in its place."""
 
+import json
 from pathlib import Path
 from typing import Any
 
 from zarr.storage import LocalStore
 
+from dirax.solution.sweep_store import MESSAGE, STATUS, attributes_of
 from dirax.solution.zarr_store import NODE
 
 
@@ -19,6 +21,9 @@ class SameStore(LocalStore):
     def __init__(self, root: Path | str, *, read_only: bool = True):
         super().__init__(root, read_only=read_only)
         self._first = _written(self.root)
+        about = attributes_of(self.root)
+        self._axes = len(json.loads(about["dims"]))
+        self._blocks = {*json.loads(about["arrays"])} - {MESSAGE}  # where there is no message there is no block
 
     def _still(self, found: Any) -> Any:
         """What was found, if it is of the store that was opened."""
@@ -29,13 +34,24 @@ class SameStore(LocalStore):
             )
         return found
 
-    async def get(self, *key: Any, **how: Any) -> Any:
-        """As of any store; raises `StoreReplaced`, as the next two do."""
-        return self._still(await super().get(*key, **how))
+    def _whole(self, key: str, found: Any) -> Any:
+        """The same of a block; None for one that is not there yet. What says that points are finished is written last."""
+        name, _, numbers = key.partition("/c.")
+        status = self.root / f"{STATUS}/c.{'.'.join(numbers.split('.')[: self._axes])}"
+        if found is None and name in self._blocks and numbers and status.exists() and not (self.root / key).exists():
+            raise RuntimeError(
+                f"{self.root / key} is gone, which the finished points of {name} are in: delete {status}, and the same call of "
+                "dx.sweep computes them again."
+            )
+        return self._still(found)
 
-    def get_sync(self, *key: Any, **how: Any) -> Any:
+    async def get(self, key: str, *given: Any, **how: Any) -> Any:
+        """As of any store; raises `StoreReplaced`, as the next two do."""
+        return self._whole(key, await super().get(key, *given, **how))
+
+    def get_sync(self, key: str, *given: Any, **how: Any) -> Any:
         """The same."""
-        return self._still(super().get_sync(*key, **how))
+        return self._whole(key, super().get_sync(key, *given, **how))
 
     async def get_partial_values(self, *keys: Any, **how: Any) -> Any:
         """The same of parts."""

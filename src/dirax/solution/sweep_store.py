@@ -14,6 +14,9 @@ if TYPE_CHECKING:
 SWEEP = "dirax_sweep_format"
 """The attribute of the store of a sweep: the version of its layout."""
 
+STATUS, MESSAGE = "status", "message"
+"""The arrays that say what became of a point."""
+
 FORMAT = 1
 """The version that is written; a store of a later one is refused."""
 

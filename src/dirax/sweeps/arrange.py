@@ -7,10 +7,12 @@ from typing import Any
 import numpy as np
 
 from dirax.solution.description import Description, describe
+from dirax.solution.export import axes_in_time
+from dirax.solution.sweep_store import MESSAGE, STATUS
 from dirax.sweeps.axes import Axes
 from dirax.sweeps.grid import Grid, cut
 from dirax.sweeps.keep import Keep
-from dirax.sweeps.layout import MESSAGE, STATUS, TEXT, Array, Layout
+from dirax.sweeps.layout import TEXT, Array, Layout
 from dirax.sweeps.trial import Trial
 
 TASK_BYTES = 2**26
@@ -42,9 +44,8 @@ def arranged(axes: Axes, trial: Trial, units: Any, coordinates: Any) -> tuple[La
         )
     arrays = _kept(trial.keep, own) if trial.keep.function is not None else _rows(sol, said)
     inner = {dim for array in arrays.values() for dim in array.dims}
-    for dim in ("time", "interval", "coordinate"):
-        if dim in said.axes and dim in inner:
-            axis = said.axes[dim]
+    for dim, axis in axes_in_time(trial.sol, said.axes).items():
+        if dim in inner:
             kind = TEXT if axis.values.dtype == object else "float64"
             named[dim] = Array((dim,), (), kind, dict(axis.about)), axis.values
     if both := sorted(arrays.keys() & named.keys()):

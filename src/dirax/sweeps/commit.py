@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from dirax.solution.flushed_files import UNFINISHED, flushed, writing
+from dirax.solution.sweep_store import MESSAGE, STATUS
 from dirax.sweeps.grid import Index
-from dirax.sweeps.layout import MESSAGE, STATUS, Layout
+from dirax.sweeps.layout import Layout
 
 
 def commit(folder: Path, layout: Layout, index: Index, blocks: Mapping[str, np.ndarray]) -> None:

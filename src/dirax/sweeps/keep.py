@@ -19,12 +19,12 @@ from dirax.program.memo import Memo, Same
 from dirax.solution.description import layout_of
 from dirax.solution.solution import Solution
 from dirax.solution.stored import TYPES
+from dirax.solution.sweep_store import MESSAGE, STATUS
 from dirax.solution.trajectory import BLOCK
 from dirax.sweeps.axes import PointError, described
 from dirax.sweeps.case import Values, in_words
 from dirax.sweeps.columns import Column, spread
 from dirax.sweeps.energy import energy_of, is_quick
-from dirax.sweeps.layout import MESSAGE, STATUS
 
 NAME = re.compile(r"\w[\w \-+.,()\[\]=%]{0,99}")
 """What kept arrays, which are folders of a store, may be called."""

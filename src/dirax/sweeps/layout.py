@@ -23,8 +23,6 @@ TEXTS = {"name": "vlen-utf8"}
 OPEN, OK, FAILED, REFUSED = 0, 1, 2, 3
 """What `status` says of a point: it has not been run, ran to the end, failed, or was refused before its first step."""
 
-STATUS, MESSAGE = "status", "message"
-
 
 @dataclass(frozen=True)
 class Array:

@@ -11,11 +11,11 @@ import numpy as np
 
 from dirax.solution.atomic_files import checked_place, placed
 from dirax.solution.flushed_files import flush_folder, flushed, writing
-from dirax.solution.sweep_store import attributes_of, group_of
+from dirax.solution.sweep_store import STATUS, attributes_of, group_of
 from dirax.solution.zarr_store import is_store
 from dirax.sweeps.axes import Axes
 from dirax.sweeps.grid import Grid, Index
-from dirax.sweeps.layout import OPEN, STATUS, TEXT, Array, Layout, decoded_texts, encoded_texts
+from dirax.sweeps.layout import OPEN, TEXT, Array, Layout, decoded_texts, encoded_texts
 
 NODE = "zarr.json"
 

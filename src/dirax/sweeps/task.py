@@ -14,11 +14,12 @@ from dirax.engines.threads import at_most
 from dirax.run.failure_messages import brief
 from dirax.run.simulate import simulate
 from dirax.solution.solution import Solution
+from dirax.solution.sweep_store import MESSAGE, STATUS
 from dirax.sweeps.case import Case, Values
 from dirax.sweeps.commit import commit
 from dirax.sweeps.grid import Index
 from dirax.sweeps.keep import Keep
-from dirax.sweeps.layout import FAILED, MESSAGE, OK, OPEN, REFUSED, STATUS, Layout
+from dirax.sweeps.layout import FAILED, OK, OPEN, REFUSED, Layout
 
 
 class Stopped(Exception):
