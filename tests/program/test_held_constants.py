@@ -1,4 +1,4 @@
-"""Constants that no node of a graph holds: keys of jax.random, single precision, whole numbers above 2⁵³."""
+"""Constants that no node of a graph of float64 stands for: keys of jax.random, single precision, whole numbers above 2⁵³."""
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +28,8 @@ def split_in_a_loop(q):
         lambda q: drawn(q, jax.random.PRNGKey(0)),
         split_in_a_loop,
         lambda q: jnp.sum(WEIGHTS.astype(float) * q[0] ** jnp.arange(2.0, 5.0)),
+        lambda q: jax.jit(lambda weights: jnp.sum(jnp.tanh((weights * weights).astype(float) * q[0]) ** 2))(WEIGHTS),
+        lambda q: WEIGHTS[jnp.argmax(WEIGHTS - WEIGHTS[1])].astype(float) * jnp.float16(0.5).astype(float) * q[0] ** 2,
         lambda q: q[0] ** 2 * (jnp.uint64(2**63 + 12345) >> 60).astype(float) / 16,
     ],
 )
@@ -44,6 +46,15 @@ def test_single_precision_of_the_state_is_said():
     system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - (q.astype(jnp.float32).astype(float) ** 2).sum() / 2)
     with pytest.raises(Exception, match="float32"):
         dx.simulate(system, dx.LagrangeDAlembert(), q=[1.0], v=[0.2], step=0.1, steps=20, engine="native")
+
+
+def test_a_network_of_single_precision_that_is_closed_over_runs_natively():
+    weights = np.random.default_rng(0).normal(size=(4, 2)).astype(np.float32)
+    with jax.numpy_dtype_promotion("standard"):
+        network = lambda q: jnp.tanh(jnp.asarray(weights) @ q) @ weights[:, 0]
+        system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q / 2 - network(q))
+        sol = dx.simulate(system, dx.Collocation(2), q=[0.3, 0.2], v=[0.1, 0.4], step=0.1, steps=20)
+        assert sol.stats["engine"] == "native" and dx.verify(sol).ok
 
 
 def test_products_of_constants_have_the_bits_of_their_sums(monkeypatch):

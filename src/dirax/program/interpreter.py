@@ -18,6 +18,9 @@ Nodes = np.ndarray
 MANY = 256
 """Entries of an array from which on it pays to look for equal ones."""
 
+SHORT = (np.dtype(np.float32), np.dtype(np.float16))
+"""Floats all of which float64 has: constants are held, and what is made of constants alone is found by JAX in their own type."""
+
 LOOP_LIMIT = 4096
 """Most iterations of one loop that are written out."""
 
@@ -96,7 +99,7 @@ class Interpreter:
             return Unavailable(UnsupportedPrimitive("constant", "is a value that JAX traces", "a captured array"))
         known = isinstance(value, jax.Array | np.ndarray | np.generic)
         dtype = value.dtype if known else np.asarray(value).dtype
-        if not is_held_by_nodes(dtype):
+        if not is_held_by_nodes(dtype) and dtype not in SHORT:
             failure = UnsupportedPrimitive("constant", f"has dtype {dtype}", "a captured array")
             return Held(value, failure) if known else Unavailable(failure)
         array = np.asarray(value)
@@ -104,6 +107,7 @@ class Interpreter:
             return Held(
                 value, UnsupportedPrimitive("constant", "is a whole number that float64 does not hold", "a captured array")
             )
+        array = array.astype(np.float64) if dtype in SHORT else array
         numbers = array.ravel().tolist()
         if array.dtype != np.float64 or len(numbers) < MANY:
             return np.array(list(map(self.graph.constant, numbers)), dtype=np.int64).reshape(array.shape)
@@ -178,7 +182,8 @@ class Interpreter:
                 return self._known(equation, operands) or [Unavailable(lost.error)] * len(equation.outvars)
             if name not in self.rules:
                 raise Unsupported("is not supported")
-            check_dtypes(equation)
+            if name not in LAZY:  # those look at what is inside
+                check_dtypes(equation)
             results = self.rules[name](self, equation, *operands)
             return [self.whole(x, v) if is_integer(v) else x for x, v in zip(results, equation.outvars, strict=True)]
         except Unsupported as error:
