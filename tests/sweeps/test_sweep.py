@@ -557,6 +557,19 @@ def test_numbers_of_several_types_are_kept_and_given_in_one_that_has_them_all(tm
         assert np.array_equal(data.q.values[0, j], single([1.0, 1.5][j > 0], angles[j]).q)
 
 
+def test_a_store_that_grows_keeps_the_types_of_its_numbers(tmp_path):
+    path = tmp_path / "grown.zarr"
+    kept = lambda sol: {"x": sol.q[0, 0] if sol.q[0, 0] < 1.0 else 0}
+    study(path, {"g": [1.0], "angle": [0.25, 0.5]}, keep=kept)
+    for angles in ([2.0, 0.25, 0.5], np.r_[np.linspace(2.0, 3.0, 40), 0.25, 0.5]):
+        data = study(path, {"g": [1.0], "angle": angles}, keep=kept)
+        assert np.array_equal(data.x.values[0], np.where(data.angle < 1.0, data.angle, 0.0))
+    whole = study(tmp_path / "whole.zarr", {"g": [1.0], "angle": [1.5, 2.0]}, keep=kept)
+    assert whole.x.dtype == np.int64
+    whole = study(tmp_path / "whole.zarr", {"g": [1.0], "angle": [0.25, 1.5, 2.0]}, keep=kept)
+    assert whole.x.values[0].tolist() == [0.25, 0.0, 0.0]
+
+
 def test_a_type_that_does_not_have_a_later_number_is_one_error(tmp_path):
     many = {"g": np.linspace(1.0, 2.0, 1000), "angle": [0.5]}
     odd = lambda g: 0.3 < (g - 1.0) * 999.0 - 500.0 < 1.3

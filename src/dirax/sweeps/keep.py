@@ -25,6 +25,7 @@ from dirax.sweeps.axes import PointError, described
 from dirax.sweeps.case import Values, in_words
 from dirax.sweeps.columns import Column, spread
 from dirax.sweeps.energy import energy_of, is_quick
+from dirax.sweeps.layout import Layout
 
 NAME = re.compile(r"\w[\w \-+.,()\[\]=%]{0,99}")
 """What kept arrays, which are folders of a store, may be called."""
@@ -56,6 +57,12 @@ class Keep:
         if function is not None and not callable(function):
             raise TypeError(f"keep must be a function of a solution that returns a dict, but {function!r:.60} was given.")
         return cls(function, "rows" if function is None else "singles")
+
+    def typed(self, layout: Layout) -> "Keep":
+        """The same with the types that a store has."""
+        if self.function is None:
+            return self
+        return replace(self, like={name: like.astype(layout.arrays[name].dtype) for name, like in self.like.items()})
 
     def chosen(self, sol: Solution, values: Values) -> "Keep":
         """The same as it is to be called, by the trajectories of a batch at these points. Raises `PointError`."""

@@ -6,7 +6,7 @@ block of `status` is written last, by one renaming, and is what says that the ot
 
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +51,14 @@ class Layout:
     def point_bytes(self) -> int:
         """Bytes that a point takes, apart from messages."""
         return sum(_size(array) for array in self.arrays.values())
+
+    def beside(self, other: "Layout") -> "Layout":
+        """The same with arrays of types that have the numbers of another layout too."""
+        arrays = dict(self.arrays)
+        for name, array in arrays.items():
+            if name in other.arrays and TEXT not in (array.dtype, other.arrays[name].dtype):
+                arrays[name] = replace(array, dtype=np.result_type(array.dtype, other.arrays[name].dtype).name)
+        return replace(self, arrays=arrays)
 
     def file(self, name: str, index: Index) -> Path:
         """Where a block of an array is, in the folder of the store."""

@@ -38,6 +38,7 @@ def settled(
             if there is None:
                 return layout_of(path), axes_of(path)
             old, places = layout_of(path), there
+            layout = layout.beside(old)
             refuse_more_than_disk(path, axes.size * layout.point_bytes, FEWER)
             with made(path, True) as beside:
                 write_description(beside, layout, named, attributes)

@@ -147,7 +147,7 @@ def sweep(
             system=whole,
             scheme=scheme,
             case=trial.case,
-            keep=trial.keep,
+            keep=trial.keep.typed(layout),
             options=options,
             params=params,
             filled=trial.engine == "xla",
