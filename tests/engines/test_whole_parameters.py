@@ -51,6 +51,20 @@ def test_whole_numbers_of_any_size_are_those_of_jax(number, stiffness, engine):
     np.testing.assert_allclose(sol.energy(), 1.0, atol=1e-13)
 
 
+@pytest.mark.parametrize("kind", [np.longdouble, ">f8", np.float16])
+def test_floats_of_other_kinds(kind):
+    sol = dx.simulate(
+        oscillator(lambda p: jnp.asarray(p[0], float)),
+        MIDPOINT,
+        q=np.ones(1),
+        v=np.zeros(1),
+        params=np.array([2.0], kind),
+        step=0.1,
+        steps=30,
+    )
+    np.testing.assert_allclose(sol.q[-1, 0], cayley(2.0, 0.1, 30), atol=1e-13)
+
+
 @pytest.mark.parametrize("engine", ["xla", "auto"])
 def test_a_table_read_where_the_params_are_captured(engine):
     """sol.params can be closed over and read by an index that JAX traces, as can what a failed step is explained from."""

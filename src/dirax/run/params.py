@@ -130,7 +130,9 @@ def arrays_of_params(params: Any) -> Any:
 
 
 def _native(array: np.ndarray) -> np.ndarray:
-    """The array in the byte order of this machine."""
+    """The array in the byte order of this machine, in double precision where it has more."""
+    if array.dtype in (np.longdouble, np.clongdouble):
+        return array.astype(complex if array.dtype.kind == "c" else float)
     return array if array.dtype.isnative else array.astype(array.dtype.newbyteorder("="))
 
 
