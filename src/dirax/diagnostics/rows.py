@@ -12,6 +12,7 @@ import numpy as np
 from dirax.program.compiled import compiled
 from dirax.program.evaluation.functions import in_numpy
 from dirax.program.evaluation.noise import Noise
+from dirax.program.side_by_side import of_one, side_by_side, waits
 from dirax.schemes.step import Shape
 from dirax.solution.solution import Solution
 from dirax.solution.trajectory import SavedRow
@@ -82,8 +83,9 @@ def _compiled(function: Callable, sol: Solution, items: tuple) -> np.ndarray:
 
 
 def _of_pieces(function, items, params, axis):
-    lane = jax.vmap(lambda item, params: function(*item, params), in_axes=(0, None))
-    return jax.vmap(lane, in_axes=(0, axis))(items, params)
+    one = lambda item, params: function(*item, params)
+    waiting = waits(one, of_one(items, 2), of_one(params, axis is not None))
+    return side_by_side(side_by_side(one, (0, None), waiting), (0, axis), waiting)(items, params)
 
 
 _piece = compiled(_of_pieces, seldom=True)

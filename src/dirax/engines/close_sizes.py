@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from dirax.engines.first_sizes import NOTHING, TYPICAL
 from dirax.engines.stage_look import END, RESIDUAL, SLOPES, TERMS, stage_look
@@ -19,6 +20,7 @@ from dirax.engines.stopping import STALLED
 from dirax.numerics.equilibration import LEAST_SIZE, balanced_inverse, power_of_two
 from dirax.numerics.tolerances import EPSILON
 from dirax.program.rounding import rounding
+from dirax.program.side_by_side import side_by_side
 from dirax.schemes.step import first_of_each
 
 
@@ -70,8 +72,9 @@ def close_sizes(at: Entries) -> list[np.ndarray]:
 
 
 def sizes_at(equation: Any, state: Any, guess: tuple, params: Any, t: Any, h: Any, axes: tuple | None = None) -> tuple:
-    """The sizes of each stage of a step from a state, over a batch with the `axes` of (state, guess, params, t), by
-    JAX."""
+    """The sizes of each stage of a step from a state, over a batch with the `axes` of (state, guess, params, t), by JAX.
+
+    States are looked at one after the other, for the reason that `side_by_side.py` gives."""
 
     def one(state, guess, params, t):
         def linear(i, u, xs, part):
@@ -83,7 +86,7 @@ def sizes_at(equation: Any, state: Any, guess: tuple, params: Any, t: Any, h: An
                 by_u, by_h = jax.jacfwd(residual, argnums=(0, 1))(u, h)
                 return residual(u, h), jnp.concatenate([by_u, by_h[:, None]], axis=1)
 
-            return jax.vmap(at)(jnp.stack(xs), jnp.array(part) * fraction * h)
+            return lax.map(lambda given: at(*given), (jnp.stack(xs), jnp.array(part) * fraction * h))
 
         def terms(i, u, xs, sizes):
             stage, fraction = equation.stages[i]
@@ -93,7 +96,7 @@ def sizes_at(equation: Any, state: Any, guess: tuple, params: Any, t: Any, h: An
                 numbers = u, x, t, fraction * h
                 return rounding(residual, *numbers, errors=(sizes, *map(jnp.abs, numbers[1:])))
 
-            return jax.vmap(at)(jnp.stack(xs))
+            return lax.map(at, jnp.stack(xs))
 
         end, found = state, []
         for i in first_of_each(equation.stages):
@@ -110,7 +113,7 @@ def sizes_at(equation: Any, state: Any, guess: tuple, params: Any, t: Any, h: An
         return tuple(found)
 
     given = jnp.asarray(state, float), tuple(jnp.asarray(u, float) for u in guess), params, t
-    return one(*given) if axes is None else jax.vmap(one, in_axes=axes)(*given)
+    return one(*given) if axes is None else side_by_side(one, axes)(*given)
 
 
 def _updated(residual: Any, slopes: Any, u: Any, xp: ModuleType) -> Any:

@@ -15,6 +15,7 @@ from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.program.memo import Same
 from dirax.program.roots import FEWEST_SPARSE
 from dirax.program.scalar_program import ScalarProgram
+from dirax.program.side_by_side import side_by_side
 from dirax.program.user_functions import is_traced
 from dirax.run.validate import Case, spread
 
@@ -210,7 +211,7 @@ def begins_by_arrays(case: Case) -> bool:
 @functools.partial(compiled, seldom=True)
 def _compiled(one: Any, arguments: tuple, axes: tuple | None) -> Any:
     """One compiled function for all of it, reused by later runs of equal systems and schemes."""
-    return (one if axes is None else jax.vmap(one, in_axes=axes))(*arguments)
+    return (one if axes is None else side_by_side(one, axes))(*arguments)
 
 
 def _in_numpy(one: Any, kept: tuple, case: Case, given: Any) -> Any:

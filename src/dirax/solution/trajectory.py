@@ -15,6 +15,7 @@ from dirax.program.compiled import compiled
 from dirax.program.evaluation.functions import in_numpy
 from dirax.program.hoisted import split
 from dirax.program.memo import Same, by_value
+from dirax.program.side_by_side import of_one, side_by_side, waits
 from dirax.program.stated import as_stated
 from dirax.program.user_functions import is_traced
 from dirax.schemes.step import CLOCK, Field, Shape, make_step_equation
@@ -394,8 +395,10 @@ def _at_nodes(of_steps: Any, axis: int) -> Any:
 @compiled
 def _along(function, nodes, params, axes):
     """`function` of every row, compiled once per function and shape: a system's bound method is compared by its system."""
-    along = jax.vmap(lambda row, params: function(SavedRow(row), split(params, function, None)[0]), in_axes=(0, None))
-    return (along if axes is None else jax.vmap(along, in_axes=axes))(nodes, params)
+    one = lambda row, params: function(SavedRow(row), split(params, function, None)[0])
+    waiting = waits(one, of_one(nodes, 1 if axes is None else 2), of_one(params, axes is not None and axes[1] is not None))
+    along = side_by_side(one, (0, None), waiting)
+    return (along if axes is None else side_by_side(along, axes, waiting))(nodes, params)
 
 
 def last_rows(nodes: list[np.ndarray]) -> np.ndarray:

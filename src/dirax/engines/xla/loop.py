@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from dirax.engines.contract import OK, Problem
 from dirax.engines.xla.lane import Lane, Numerics, packed_row, parts_of_row, take_step, time_of, unpacked_row
 from dirax.program.compiled import compiled, known_options
+from dirax.program.side_by_side import of_one, side_by_side, waits
 
 CHUNK_BYTES = 2**20
 """Largest buffer of saved rows on the device. Runs of more go through it several times; runs of less pay for all of it."""
@@ -54,14 +55,29 @@ def make_step(equation, axes, max_iterations: int, differentiable: bool, numeric
         after, unknowns, states = take_step(equation, lane, t, clock.h, params, sizes, max_iterations, differentiable, numerics)
         return after, packed_row(equation, lane, unknowns, states)
 
-    return one if axes is None else jax.vmap(one, in_axes=(*axes, 0, None))
+    if axes is None:
+        return one
+
+    def together(lanes, params, sizes, clock):
+        waiting = _waits(equation, of_one(params, axes[1] is not None))
+        return side_by_side(one, (*axes, 0, None), waiting)(lanes, params, sizes, clock)
+
+    return together
+
+
+def _waits(equation, params) -> bool:
+    """Whether the residuals of trajectories, with their derivatives, could have the threads of XLA wait for one another."""
+    vector, number = (lambda size: jax.ShapeDtypeStruct((size,), jnp.float64)), jax.ShapeDtypeStruct((), jnp.float64)
+    given = ((stage, vector(stage.unknowns), vector(stage.state_size)) for stage, _ in equation.stages)
+    return any(waits(stage.residual, u, state, number, number, params) for stage, u, state in given)
 
 
 def unpack_rows(equation, axes, packed, params, clock: Clock) -> dict:
     """The named arrays of packed rows (rows, …)."""
     one = lambda row, params: unpacked_row(equation, row, clock.t0, clock.h, clock.first_step, params)
-    lanes = one if axes is None else jax.vmap(one, in_axes=axes)
-    return jax.vmap(lanes, in_axes=(0, None))(packed, params)
+    waiting = waits(one, of_one(packed, 1 if axes is None else 2), of_one(params, axes is not None and axes[1] is not None))
+    lanes = one if axes is None else side_by_side(one, axes, waiting)
+    return side_by_side(lanes, (0, None), waiting)(packed, params)
 
 
 @functools.cache

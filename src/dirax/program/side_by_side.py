@@ -1,0 +1,69 @@
+"""Functions at many entries by XLA: side by side, or one after the other where its threads would wait for one another.
+
+On a CPU XLA gives a decomposition or a solve of many matrices as work to its threads, and a thread that has begun one waits until
+others have done it. As soon as as many are begun at a time as there are threads, all wait and none ends: on two cores for a
+Lagrangian with two inverses in it.
+"""
+
+import os
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.extend.core import jaxprs_in_params
+
+SHARED = frozenset(("lu", "triangular_solve", "cholesky", "qr", "geqrf", "householder_product", "svd", "eigh", "eig", "schur"))
+"""What is shared out to threads, in the words of JAX."""
+
+OWN = ("dirax_solve", "dirax_scaled_inverse", "dirax_pseudo_inverse", "dirax_least_change", "dirax_root")
+"""The same in those of dirax."""
+
+DERIVED = 4
+"""How many a derivative has for one of its function."""
+
+
+def side_by_side(function: Callable, in_axes: tuple, waiting: bool | None = None) -> Callable:
+    """`jax.vmap(function, in_axes)` for axes 0 and None, but for a function whose entries would wait for one another, as
+    `waiting` says, or `waits` of it."""
+
+    def call(*values: Any) -> Any:
+        entry = [of_one(value, axis is not None) for value, axis in zip(values, in_axes, strict=True)]
+        if not (waits(function, *entry) if waiting is None else waiting):
+            return jax.vmap(function, in_axes)(*values)
+        moving = [value for value, axis in zip(values, in_axes, strict=True) if axis is not None]
+
+        def at(given: list[Any]) -> Any:
+            rest = iter(given)
+            return function(*(next(rest) if axis is not None else v for v, axis in zip(values, in_axes, strict=True)))
+
+        return lax.map(at, moving)
+
+    return call
+
+
+def of_one(values: Any, axes: int) -> Any:
+    """The shapes of arrays without so many axes in front."""
+    return jax.tree.map(lambda a: jax.ShapeDtypeStruct(jnp.shape(a)[axes:], jnp.result_type(a)), values)
+
+
+def waits(function: Callable, *values: Any) -> bool:
+    """Whether a function of values like these, side by side, could have all threads of XLA wait for one another."""
+    return jax.default_backend() == "cpu" and _shared(jax.make_jaxpr(function)(*values).jaxpr) >= threads()
+
+
+def threads() -> int:
+    """How many XLA has."""
+    given = os.environ.get("NPROC", "")
+    return int(given) if given.isdigit() and int(given) else os.cpu_count() or 1
+
+
+def _shared(jaxpr: Any) -> int:
+    found = 0
+    for equation in jaxpr.eqns:
+        name = equation.primitive.name
+        inside = sum(_shared(getattr(inner, "jaxpr", inner)) for inner in jaxprs_in_params(equation.params))
+        derives = name in ("dirax_derivative", "dirax_directional", "dirax_pullback")
+        found += (name in SHARED or name in OWN) + inside * (DERIVED if derives else 1)
+    return found
