@@ -1,12 +1,11 @@
 """The store of a sweep, read from while nobody else has put another one in its place."""
 
-import json
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
 from zarr.storage import LocalStore
 
-from dirax.solution.sweep_store import MESSAGE, STATUS, attributes_of
 from dirax.solution.zarr_store import NODE
 
 
@@ -18,12 +17,14 @@ class SameStore(LocalStore):
     """A store that is read only, and only as the one that was there when it was opened: a sweep that grows puts another one in
     its place, with a description that is written once."""
 
-    def __init__(self, root: Path | str, *, read_only: bool = True):
+    def __init__(self, root: Path | str, axes: int, blocks: Collection[str], status: str, *, read_only: bool = True):
+        """`blocks`: arrays of which a block is there once that of `status` is, which has so many `axes`."""
         super().__init__(root, read_only=read_only)
-        self._first = _written(self.root)
-        about = attributes_of(self.root)
-        self._axes = len(json.loads(about["dims"]))
-        self._blocks = {*json.loads(about["arrays"])} - {MESSAGE}  # where there is no message there is no block
+        self._first, self._of_blocks = _written(self.root), (axes, blocks, status)
+
+    def with_read_only(self, read_only: bool = False) -> "SameStore":
+        """The same, read only or not."""
+        return SameStore(self.root, *self._of_blocks, read_only=read_only)
 
     def _still(self, found: Any) -> Any:
         """What was found, if it is of the store that was opened."""
@@ -36,9 +37,9 @@ class SameStore(LocalStore):
 
     def _whole(self, key: str, found: Any) -> Any:
         """The same of a block; None for one that is not there yet. What says that points are finished is written last."""
-        name, _, numbers = key.partition("/c.")
-        status = self.root / f"{STATUS}/c.{'.'.join(numbers.split('.')[: self._axes])}"
-        if found is None and name in self._blocks and numbers and status.exists() and not (self.root / key).exists():
+        (name, _, numbers), (axes, blocks, status_name) = key.partition("/c."), self._of_blocks
+        status = self.root / f"{status_name}/c.{'.'.join(numbers.split('.')[:axes])}"
+        if found is None and name in blocks and numbers and status.exists() and not (self.root / key).exists():
             raise RuntimeError(
                 f"{self.root / key} is gone, which the finished points of {name} are in: delete {status}, and the same call of "
                 "dx.sweep computes them again."

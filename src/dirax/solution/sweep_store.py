@@ -59,7 +59,9 @@ def opened(path: Path) -> "Dataset":
 
     from dirax.solution.same_store import SameStore  # imported when it is used
 
-    attributes_of(path)
+    about = attributes_of(path)
     for node in path.glob(f"*/{NODE}"):
         plain_bytes(node, node.relative_to(path), LONGEST_NODE)
-    return xr.open_zarr(SameStore(path), chunks={} if find_spec("dask") else None)  # type: ignore[arg-type]
+    blocks = {*json.loads(about["arrays"])} - {MESSAGE}  # where there is no message there is no block
+    store = SameStore(path, len(json.loads(about["dims"])), blocks, STATUS)
+    return xr.open_zarr(store, chunks={} if find_spec("dask") else None)  # type: ignore[arg-type]
