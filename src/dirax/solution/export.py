@@ -52,8 +52,7 @@ def axes_in_time(sol: Trajectory, axes: Mapping[str, Variable]) -> dict[str, Var
     if sol.batch is None:
         t = np.asarray(sol.t)
         found |= {
-            n: Variable(axes[n].dims, t[: len(axes[n].values)], {**axes[n].about, "long_name": "time"})
-            for n in ROWS & axes.keys()
+            n: Variable(axes[n].dims, t[: len(axes[n].values)], {**axes[n].about, "long_name": "time"}) for n in axes if n in ROWS
         }
     return found
 

@@ -37,6 +37,7 @@ class SameStore(LocalStore):
 
     def _whole(self, key: str, found: Any) -> Any:
         """The same of a block; None for one that is not there yet. What says that points are finished is written last."""
+        self._still(found)
         (name, _, numbers), (axes, blocks, status_name) = key.partition("/c."), self._of_blocks
         status = self.root / f"{status_name}/c.{'.'.join(numbers.split('.')[:axes])}"
         if found is None and name in blocks and numbers and status.exists() and not (self.root / key).exists():
@@ -44,7 +45,7 @@ class SameStore(LocalStore):
                 f"{self.root / key} is gone, which the finished points of {name} are in: delete {status}, and the same call of "
                 "dx.sweep computes them again."
             )
-        return self._still(found)
+        return found
 
     async def get(self, key: str, *given: Any, **how: Any) -> Any:
         """As of any store; raises `StoreReplaced`, as the next two do."""

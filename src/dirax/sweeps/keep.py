@@ -62,7 +62,7 @@ class Keep:
         """The same with the types that a store has."""
         if self.function is None:
             return self
-        return replace(self, like={name: like.astype(layout.arrays[name].dtype) for name, like in self.like.items()})
+        return replace(self, like={name: np.zeros(like.shape, layout.arrays[name].dtype) for name, like in self.like.items()})
 
     def chosen(self, sol: Solution, values: Values) -> "Keep":
         """The same as it is to be called, by the trajectories of a batch at these points. Raises `PointError`."""
