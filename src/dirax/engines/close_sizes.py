@@ -11,7 +11,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 
 from dirax.engines.first_sizes import NOTHING, TYPICAL
 from dirax.engines.stage_look import END, RESIDUAL, SLOPES, TERMS, stage_look
@@ -20,7 +19,7 @@ from dirax.engines.stopping import STALLED
 from dirax.numerics.equilibration import LEAST_SIZE, balanced_inverse, power_of_two
 from dirax.numerics.tolerances import EPSILON
 from dirax.program.rounding import rounding
-from dirax.program.side_by_side import side_by_side
+from dirax.program.side_by_side import one_by_one, side_by_side
 from dirax.schemes.step import first_of_each
 
 
@@ -86,7 +85,7 @@ def sizes_at(equation: Any, state: Any, guess: tuple, params: Any, t: Any, h: An
                 by_u, by_h = jax.jacfwd(residual, argnums=(0, 1))(u, h)
                 return residual(u, h), jnp.concatenate([by_u, by_h[:, None]], axis=1)
 
-            return lax.map(lambda given: at(*given), (jnp.stack(xs), jnp.array(part) * fraction * h))
+            return one_by_one(at, (0, 0))(jnp.stack(xs), jnp.array(part) * fraction * h)
 
         def terms(i, u, xs, sizes):
             stage, fraction = equation.stages[i]
@@ -96,7 +95,7 @@ def sizes_at(equation: Any, state: Any, guess: tuple, params: Any, t: Any, h: An
                 numbers = u, x, t, fraction * h
                 return rounding(residual, *numbers, errors=(sizes, *map(jnp.abs, numbers[1:])))
 
-            return lax.map(at, jnp.stack(xs))
+            return one_by_one(at, (0,))(jnp.stack(xs))
 
         end, found = state, []
         for i in first_of_each(equation.stages):

@@ -30,13 +30,23 @@ def side_by_side(function: Callable, in_axes: tuple, waiting: bool | None = None
 
     def call(*values: Any) -> Any:
         entry = [of_one(value, axis is not None) for value, axis in zip(values, in_axes, strict=True)]
-        if not (waits(function, *entry) if waiting is None else waiting):
-            return jax.vmap(function, in_axes)(*values)
+        waits_now = waits(function, *entry) if waiting is None else waiting
+        return (one_by_one if waits_now else jax.vmap)(function, in_axes)(*values)
+
+    return call
+
+
+def one_by_one(function: Callable, in_axes: tuple) -> Callable:
+    """What `jax.vmap(function, in_axes)` computes, entry after entry, each as a batch of one: what dirax has primitives for is
+    made of JAX's then as under `jax.vmap`, and not while XLA's modules are being built."""
+
+    def call(*values: Any) -> Any:
         moving = [value for value, axis in zip(values, in_axes, strict=True) if axis is not None]
 
         def at(given: list[Any]) -> Any:
-            rest = iter(given)
-            return function(*(next(rest) if axis is not None else v for v, axis in zip(values, in_axes, strict=True)))
+            rest = iter(jax.tree.map(lambda a: a[None], given))
+            batch = [next(rest) if axis is not None else value for value, axis in zip(values, in_axes, strict=True)]
+            return jax.tree.map(lambda a: a[0], jax.vmap(function, in_axes)(*batch))
 
         return lax.map(at, moving)
 
