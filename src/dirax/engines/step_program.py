@@ -8,13 +8,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, jaxprs_in_params
+from jax.extend.core import ClosedJaxpr
 
 import dirax.program.rules  # noqa: F401  (registers the rules)
 from dirax.engines import policy
 from dirax.engines.blocks import blocks
 from dirax.engines.parameters import Parameters, parameters
 from dirax.engines.step_jaxpr import step_jaxpr
+from dirax.program.counts import array_operations, nesting
 from dirax.program.equal_nodes import without_equals
 from dirax.program.evaluation.by_jax import by_jax
 from dirax.program.evaluation.in_floats import Floats, in_floats
@@ -114,37 +115,6 @@ def _nodes(
         dict(zip(names, rows, strict=True)), nesting(closed.jaxpr),
         array_operations(closed.jaxpr, policy.MORE_FOR_XLA), closed, weak,
     )  # fmt: skip
-
-
-DERIVATIVES = ("dirax_derivative", "dirax_directional", "dirax_pullback")
-
-
-def nesting(jaxpr: Any) -> int:
-    """How deep derivatives that tracing left to the graph lie in one another."""
-    known: dict[int, int] = {}
-
-    def depth(jaxpr: Any) -> int:
-        if id(jaxpr) not in known:
-            inner = [(e.primitive.name in DERIVATIVES, j) for e in jaxpr.eqns for j in jaxprs_in_params(e.params)]
-            known[id(jaxpr)] = max((derives + depth(getattr(j, "jaxpr", j)) for derives, j in inner), default=0)
-        return known[id(jaxpr)]
-
-    return depth(jaxpr)
-
-
-def array_operations(jaxpr: Any, of_derivative: float = 1.0) -> float:
-    """How many operations on arrays a jaxpr has, those inside of them counted once for each time that they stand there, and for
-    each derivative that they are under so many times."""
-    known: dict[int, float] = {}
-
-    def counted(jaxpr: Any) -> float:
-        if id(jaxpr) not in known:
-            more = lambda e: of_derivative if e.primitive.name in DERIVATIVES else 1.0
-            inner = (more(e) * counted(getattr(j, "jaxpr", j)) for e in jaxpr.eqns for j in jaxprs_in_params(e.params))
-            known[id(jaxpr)] = len(jaxpr.eqns) + sum(inner)
-        return known[id(jaxpr)]
-
-    return counted(jaxpr)
 
 
 @dataclass(eq=False)

@@ -3,6 +3,8 @@
 import os
 from contextvars import ContextVar
 
+from dirax.numerics.processors import processors
+
 at_most: ContextVar[int | None] = ContextVar("at_most", default=None)
 """Threads for batches in this context, where several batches run side by side."""
 
@@ -14,4 +16,4 @@ def thread_count() -> int:
     chosen = os.environ.get("DIRAX_THREADS", "")
     if chosen.isdigit() and int(chosen) > 0:
         return int(chosen)
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return processors()

@@ -12,13 +12,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.extend.core import jaxprs_in_params
 
-SHARED = frozenset(("lu", "triangular_solve", "cholesky", "qr", "geqrf", "householder_product", "svd", "eigh", "eig", "schur"))
-"""What is shared out to threads, in the words of JAX."""
+from dirax.numerics.processors import processors
+from dirax.program.counts import array_operations
 
-OWN = ("dirax_solve", "dirax_scaled_inverse", "dirax_pseudo_inverse", "dirax_least_change", "dirax_root")
-"""The same in those of dirax."""
+SHARED = {
+    *("lu", "triangular_solve", "cholesky", "qr", "geqrf", "householder_product", "svd", "eigh", "eig", "schur"),
+    *("dirax_solve", "dirax_scaled_inverse", "dirax_pseudo_inverse", "dirax_least_change", "dirax_root"),
+}
+"""What is shared out to threads, in the words of JAX and of dirax."""
 
 DERIVED = 4
 """How many a derivative has for one of its function."""
@@ -60,20 +62,12 @@ def of_one(values: Any, axes: int) -> Any:
 
 def waits(function: Callable, *values: Any) -> bool:
     """Whether a function of values like these, side by side, could have all threads of XLA wait for one another."""
-    return jax.default_backend() == "cpu" and _shared(jax.make_jaxpr(function)(*values).jaxpr) >= threads()
+    if jax.default_backend() != "cpu":
+        return False
+    return array_operations(jax.make_jaxpr(function)(*values).jaxpr, DERIVED, SHARED.__contains__) >= threads()
 
 
 def threads() -> int:
     """How many XLA has."""
     given = os.environ.get("NPROC", "")
-    return int(given) if given.isdigit() and int(given) else os.cpu_count() or 1
-
-
-def _shared(jaxpr: Any) -> int:
-    found = 0
-    for equation in jaxpr.eqns:
-        name = equation.primitive.name
-        inside = sum(_shared(getattr(inner, "jaxpr", inner)) for inner in jaxprs_in_params(equation.params))
-        derives = name in ("dirax_derivative", "dirax_directional", "dirax_pullback")
-        found += (name in SHARED or name in OWN) + inside * (DERIVED if derives else 1)
-    return found
+    return int(given) if given.isdigit() and int(given) else processors()

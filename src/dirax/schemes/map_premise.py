@@ -20,14 +20,13 @@ def by_a_discretization_map(map: AbstractDiscretizationMap, equation: StepEquati
     if map.is_known:
         return equation
     lifted = isinstance(map, CotangentLift)
-    refuse_other_shapes(map.map if lifted else map, size // 2 if lifted and of_relation else size)
+    own, size = map.map if lifted else map, size // 2 if lifted and of_relation else size
+    refuse_other_shapes(own, size)
 
     def check(data, h, params):
         equation.check(data, h, params)
         names = ("x",) if "x" in data else ("q", "p") if of_relation else ("q0",) if "q0" in data else ("q",)
-        own, x = map, np.concatenate([np.asarray(data[name], dtype=float) for name in names])
-        if isinstance(map, CotangentLift):
-            own, x = map.map, x[: len(x) // 2] if of_relation else x
+        x = np.concatenate([np.asarray(data[name], dtype=float) for name in names])[:size]
         own.manifold(len(x)).check_point(jnp.asarray(x), "the initial point")
         found = defects_at(own, x)
         failed = {

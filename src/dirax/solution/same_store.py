@@ -39,8 +39,10 @@ class SameStore(LocalStore):
         """The same of a block; None for one that is not there yet. What says that points are finished is written last."""
         self._still(found)
         (name, _, numbers), (axes, blocks, status_name) = key.partition("/c."), self._of_blocks
+        if found is not None or name not in blocks or not numbers:
+            return found
         status = self.root / f"{status_name}/c.{'.'.join(numbers.split('.')[:axes])}"
-        if found is None and name in blocks and numbers and status.exists() and not (self.root / key).exists():
+        if status.exists() and not (self.root / key).exists():
             raise RuntimeError(
                 f"{self.root / key} is gone, which the finished points of {name} are in: delete {status}, and the same call of "
                 "dx.sweep computes them again."

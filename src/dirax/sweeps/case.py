@@ -72,15 +72,15 @@ class Case:
     def chosen(self, values: Values) -> "Case":
         """The same with the fastest way that agrees with single calls at these points. Raises `PointError`."""
         ones = [self._one(values, number) for number in range(_size(values))]
-        each = _stacked(ones, values)
-        settled = replace(self, like=jax.tree.map(lambda leaf: leaf[0], each))
+        settled = replace(self, like=_widest(ones))
+        each = _stacked(ones, values, settled.like)
         for mode in ("scalars", "jax", "columns"):
             if mode == "jax" and "key" not in self.names:
                 continue  # what is not random and has no scalar program is compiled in every worker: columns are tried first
             if _same(replace(settled, mode=mode)._tried(values), each):
                 return replace(settled, mode=mode)
         again = self._one(values, 0)
-        if not _same(_stacked([again], values), _stacked(ones[:1], values)):
+        if not _same(_stacked([again], values, again), _stacked(ones[:1], values, ones[0])):
             raise ValueError(
                 "case gives other data when it is called again with the same point: let it take an argument rng (a generator of "
                 "NumPy) or key (of JAX), which belong to the point, for its random numbers."
@@ -215,14 +215,15 @@ def _normal(found: Any, xp: Any) -> dict[str, Any]:
     return normal
 
 
-def _stacked(ones: list[dict[str, Any]], values: Values, like: Any = None) -> dict[str, Any]:
-    """Values at single points as one, with an axis in front."""
-    if like is None:
-        first = ones[0]
-        if all(jax.tree.structure(one) == jax.tree.structure(first) for one in ones):
-            first = jax.tree.map(lambda leaf, *others: leaf.astype(np.result_type(leaf, *others)), *ones)
-    else:
-        first = like
+def _widest(ones: list[dict[str, Any]]) -> dict[str, Any]:
+    """The first of the values at single points, in types that have the numbers of all; as it is where they differ in form."""
+    if any(jax.tree.structure(one) != jax.tree.structure(ones[0]) for one in ones):
+        return ones[0]
+    return jax.tree.map(lambda leaf, *others: leaf.astype(np.result_type(leaf, *others)), *ones)
+
+
+def _stacked(ones: list[dict[str, Any]], values: Values, first: Any) -> dict[str, Any]:
+    """Values at single points as one, with an axis in front and the form and types of the `first`. Raises `PointError`."""
     form = lambda one: (jax.tree.structure(one), [leaf.shape for leaf in jax.tree.leaves(one)])
     wanted = form(first)
     for number, one in enumerate(ones):

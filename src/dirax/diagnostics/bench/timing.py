@@ -11,6 +11,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from dirax.numerics.processors import processors
+
 LIBRARIES = ("numpy", "jax", "llvmlite", "scipy", "casadi", "heyoka", "diffrax")
 
 
@@ -37,10 +39,9 @@ def machine() -> dict[str, Any]:
     """Processor, cores, load, system, and the versions of what is compared; None for what is not there."""
     found = compiler()
     described = subprocess.run([found, "--version"], capture_output=True, text=True).stdout.splitlines() if found else []
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return {
         "processor": _processor(),
-        "cores": cores,
+        "cores": processors(),
         "load_average": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),

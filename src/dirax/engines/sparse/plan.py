@@ -11,8 +11,9 @@ from dirax.engines import policy
 from dirax.engines.in_jax import joined, replaced
 from dirax.engines.sparse.by_sites import by_sites
 from dirax.engines.sparse.solver import SparseSolver
-from dirax.engines.step_program import array_operations, step_program
+from dirax.engines.step_program import step_program
 from dirax.numerics.sparse.elimination import StructurallySingular
+from dirax.program.counts import array_operations
 from dirax.program.graph import GraphTooLarge
 from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.program.memo import Memo, Same
