@@ -13,7 +13,7 @@ from dirax.engines.step_program import linearized
 from dirax.program import scalar_program
 from dirax.program.evaluation import in_numpy as module
 from dirax.program.evaluation.functions import in_numpy, program_of
-from dirax.program.linear_solves import pseudo_inverses, scaled_pseudo_inverse, solve
+from dirax.program.linear_solves import pseudo_inverse, pseudo_inverses, scaled_pseudo_inverse, solve
 from dirax.program.roots import nearest_root
 from dirax.program.rules import by_numpy
 from dirax.schemes.step import Shape, make_step_equation
@@ -21,6 +21,7 @@ from dirax.schemes.step import Shape, make_step_equation
 symmetric = lambda a: a + a.T
 CASES = {
     "singular values": lambda a, x: (scaled_pseudo_inverse(a @ a.T) @ x, jnp.linalg.svd(a, compute_uv=False)),
+    "a pseudo-inverse": lambda a, x: pseudo_inverse(a[:2], 1e-12) @ x[:2],
     "eigenvalues": lambda a, x: jnp.linalg.eigh(symmetric(a))[0] + jnp.linalg.pinv(symmetric(a)) @ x,
     "a root": lambda a, x: nearest_root(lambda u: jnp.sinh(u) + 0.1 * jnp.sin(a @ u) - x, jnp.zeros(3)),
     "a root of linear equations": lambda a, x: nearest_root(lambda u: (a @ a.T + jnp.eye(3)) @ u - x, x),
@@ -136,3 +137,22 @@ def test_pseudo_inverses_side_by_side_are_those_of_each(shape):
         size = np.max(np.abs(matrix), initial=0.0) or 1.0
         assert mine.shape == shape[::-1]
         np.testing.assert_allclose(size * mine, np.linalg.pinv(matrix / size, 1e-12), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize(("name", "by"), [("a root", "damped_step"), ("a pseudo-inverse", "pseudo_inverses")])
+def test_what_is_asked_of_the_same_entries_again_is_found_once(name, by, monkeypatch):
+    """As the energy and a hidden constraint ask for the velocities of the same rows; and never that of other entries."""
+    asked, find = [], getattr(by_numpy, by)
+    monkeypatch.setattr(by_numpy, by, lambda *given, **named: asked.append(0) or find(*given, **named))
+    rng, function = np.random.default_rng(8), CASES[name]
+    a, x = rng.normal(size=(7, 3, 3)), rng.normal(size=(7, 3))
+    found = lambda a: in_numpy(lambda a, x: jax.tree.leaves(function(a, x))[0], [a, x], (name, "asked again", len(asked)))
+    first, once = found(a), len(asked)
+    again = found(a.copy())
+    np.testing.assert_array_equal(again, first)
+    assert once == len(asked) > 0
+    again[:] = np.nan
+    np.testing.assert_array_equal(found(a), first)
+    other = found(np.where(np.arange(7)[:, None, None] == 3, 1.5 * a, a))
+    assert len(asked) > once
+    np.testing.assert_array_equal(np.all(other == first, axis=1), np.arange(7) != 3)

@@ -1,6 +1,6 @@
 """What is computed by NumPy between parts of a graph: decompositions, roots, loops whose length depends on their values."""
 
-import functools
+import hashlib
 import math
 from collections.abc import Callable
 from typing import Any
@@ -36,6 +36,9 @@ TOGETHER = 2**18
 
 LARGE_PRODUCT = 256
 """Multiplications of a product of arrays from which on it is no graph of them."""
+
+MOST_KEPT = 2**14
+"""Numbers of roots, or inverses, side by side, up to which they are kept: those of a part of the rows of a run."""
 
 MOSTLY = 16
 """A product or a matrix is of mostly zeros where no more than one in so many numbers is another one."""
@@ -190,10 +193,13 @@ def least_change(made: ScalarProgram, interpreter: Interpreter, equation: Any, m
 
 @numpy_rule("dirax_pseudo_inverse")
 def pseudo_inverse(made: ScalarProgram, interpreter: Interpreter, equation: Any, matrix: Nodes) -> list[Nodes]:
-    inverse = functools.partial(pseudo_inverses, tolerance=equation.params["tolerance"])
-    return made.between(
-        [matrix], [equation.outvars[0].aval.shape], lambda operands: _of_finite(lambda a: [inverse(a)], *operands)
-    )
+    tolerance, shape = equation.params["tolerance"], equation.outvars[0].aval.shape
+
+    def inverses(arrays: list[np.ndarray]) -> list[np.ndarray]:
+        found = lambda: _of_finite(lambda a: [pseudo_inverses(a, tolerance=tolerance)], *arrays)[0]
+        return [_kept(("pseudo-inverse", tolerance), arrays, found, len(arrays[0]) * math.prod(shape))]
+
+    return made.between([matrix], [shape], inverses)
 
 
 @numpy_rule("dirax_scaled_inverse")
@@ -319,14 +325,27 @@ def root(made: ScalarProgram, interpreter: Interpreter, equation: Any, *operands
 
     axes, (result,) = equation.params["axes"], [v.aval.shape for v in equation.outvars]
     given = [*closed.in_avals[:-1], closed.out_avals[0]]  # the guess has the shape of the residual
-    lead = result[: len(axes)]
+    lead, k = result[: len(axes)], math.prod(closed.out_avals[0].shape)
 
     def side_by_side(arrays: list[np.ndarray]) -> list[np.ndarray]:
         entries, count = len(arrays[0]), len(arrays[0]) * math.prod(lead)
         one = [a.reshape(count, *aval.shape) for a, aval in zip(arrays, given, strict=True)]
-        return [in_parts(find, one, most)[0].reshape(entries, *result)]
+        found = lambda: in_parts(find, one, most)[0].reshape(entries, *result)
+        return [_kept((Same(closed), equation.params["max_steps"], equation.params["strict"], lead), one, found, count * k)]
 
     return made.between([_in_front(nodes, axes, k, lead) for k, nodes in enumerate(operands)], [result], side_by_side)
+
+
+_last: Memo[np.ndarray] = Memo(64)
+
+
+def _kept(what: tuple, arrays: list[np.ndarray], make: Callable[[], np.ndarray], numbers: int) -> np.ndarray:
+    """What `make` finds of arrays, so many numbers; what was found last of the same ones is kept: the energy, hidden constraints
+    and structures of a run ask for the same velocities."""
+    if numbers > MOST_KEPT:
+        return make()
+    digests = [(a.shape, hashlib.blake2b(a.tobytes(), digest_size=16).digest()) for a in arrays]
+    return _last.get((*what, *digests), make).copy()
 
 
 def _in_front(nodes: Nodes, axes: Axes, number: int, lead: tuple[int, ...]) -> Nodes:
