@@ -82,6 +82,7 @@ def test_mistakes():
         (lambda m, a: m.T @ a, r"one of the group, \(gh\)·a"),
         (lambda m, a: m @ a * (1.0 + a @ a), "linear in a"),
         (lambda m, a: m @ a + 1e-5, "linear in a"),
+        (lambda m, a: 0.0 * a, r"e·a = a: it is off by .* where its values are"),
         (lambda m, a: m @ a * (1.0 + 1e-5 * jnp.trace(m)), "one of the group"),
     ],
 )

@@ -67,11 +67,24 @@ def test_cyclic_coordinates_and_oblique_translations_are_found():
     assert cyclic_coordinates(dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q), np.zeros(3)) == ()
 
 
+def test_what_is_no_symmetry_from_some_time_on_is_one_before():
+    switched = dx.LagrangeDirac(lambda t, q, v: v @ v / 2 - (1.0 + jnp.tanh(20.0 * (t - 3.0))) * jnp.cos(q[1]))
+    at = {"q": [1.0, 0.2], "v": [1.0, 0.8]}
+    for fibre, first, last in ((0, True, True), (1, True, False)):
+        assert bool(check_invariance(switched, Translations([fibre]), **at)) is first
+        assert bool(check_invariance(switched, Translations([fibre]), t=5.0, **at)) is last
+    assert cyclic_coordinates(switched, **at) == (0, 1)
+    assert cyclic_coordinates(switched, **at, t=5.0) == (0,)
+
+
 def test_mistakes():
     with pytest.raises(ValueError, match=r"action\(0, q\) = q fails by 1"):
         check_invariance(CENTRAL, GroupAction(lambda g, q: q + 1.0 + 0 * g[0], 1), q=[1.0, 0.0], params=1.0)
     with pytest.raises(ValueError, match=r"action\(g \+ h, q\)"):
         check_invariance(CENTRAL, GroupAction(lambda g, q: q + jnp.sin(g[0]), 1), q=[1.0, 0.0], params=1.0)
+    turned = lambda g, q: jnp.stack([q[0] * jnp.cos(g[0] ** 3) - q[1] * jnp.sin(g[0] ** 3), q[0] * jnp.sin(g[0] ** 3) + q[1]])
+    with pytest.raises(ValueError, match=r"action\(g \+ h, q\)"):  # at a fixed point it satisfies every law
+        check_invariance(CENTRAL, GroupAction(turned, 1), q=[0.0, 0.0], params=1.0)
     with pytest.raises(ValueError, match="does not fit a system of 2"):
         check_invariance(CENTRAL, Translations([2]), q=[1.0, 0.0], params=1.0)
     with pytest.raises(TypeError, match=r"action must be one such as dx\.Translations"):

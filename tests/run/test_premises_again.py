@@ -25,6 +25,12 @@ REDUCED = dx.reduce(
     ),
     dx.LinearConnection(fibre=[1]),
 )
+LATER = jnp.vectorize(lambda t: jnp.where(t > 3.0, 1.0, 0.0))  # a field that is switched on
+SWITCHED = dx.reduce(dx.LagrangeDirac(lambda t, q, v: v @ v / 2 - LATER(t) * jnp.cos(q[1])), dx.LinearConnection([1]))
+ROUND = dx.ManifoldLagrangian(
+    lambda q, v: v @ v / 2, dx.Product(dx.Sphere(3), dx.Torus(1)), forces=lambda t, q, v: LATER(t) * jnp.eye(4)[3] * jnp.sin(q[3])
+)
+FADING = dx.LagrangeDirac(lambda t, q, v: (v[0] ** 2 + LATER(3.5 - t) * v[1] ** 2 - q @ q) / 2)
 BODY = dx.EulerPoincare(dx.SO3(), lambda xi, params: xi @ (params["inertia"] * xi) / 2)
 
 CASES = {
@@ -51,6 +57,26 @@ CASES = {
     "symmetry": (
         *(REDUCED, dx.PlusLagrangeDirac("midpoint"), {"q": [1.0, 0.2], "v": [0.1, 0.9], "params": {"k": 1.0, "e": 0.0}}),
         *({"params": {"k": 1.0, "e": 0.1}}, "not invariant"),
+    ),
+    "symmetry at that time": (
+        *(SWITCHED, dx.PlusLagrangeDirac("midpoint"), {"q": [1.0, 0.2], "v": [0.1, 0.9]}, {"t0": 5.0}, "not invariant"),
+    ),
+    "symmetry of a bundle at that time": (
+        *(dx.reduce(ROUND, dx.LinearConnection([3])), dx.LagrangeDAlembert()),
+        *({"q": [0.0, 0.0, 1.0, 0.5], "v": [0.3, 0.2, 0.0, 0.8]}, {"t0": 5.0}, "not invariant"),
+    ),
+    "momentum along the group at that time": (
+        dx.reduce(dx.LagrangeDirac(lambda q, v: v @ v / 2, forces=lambda t, q, v: LATER(t) * v), dx.LinearConnection([1])),
+        *(dx.DiscreteRouth("midpoint"), {"q": [1.0, 0.2], "v": [0.1, 0.9]}, {"t0": 5.0}, "the forces f.* move"),
+    ),
+    "Hessian at that time": (
+        *(
+            FADING,
+            dx.DiscreteDirac(constraints="resolve"),
+            {"q": [1.0, 0.2], "v": [0.1, 0.9]},
+            {"t0": 5.0},
+            "∂²L/∂v² has rank 1 of 2",
+        ),
     ),
     "inertia": (
         *(BODY, dx.DiscreteEulerPoincare(), {"x": [0.3, 0.1, 0.2], "params": {"inertia": np.array([1.0, 2.0, 3.0])}}),

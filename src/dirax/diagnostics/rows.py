@@ -169,8 +169,9 @@ def consecutive(sol: Solution, names: tuple[str, ...], points: int, rows: np.nda
 
 
 def initial_of_one(sol: Solution) -> dict[str, Any]:
-    """The initial data of a run, of the first trajectory of a batch."""
-    return {name: np.asarray(a)[0] if np.ndim(a) == 2 else np.asarray(a) for name, a in sol.initial.items()}
+    """The initial data of a run, of the first trajectory of a batch, with the time."""
+    data = {name: np.asarray(a)[0] if np.ndim(a) == 2 else np.asarray(a) for name, a in sol.initial.items()}
+    return {**data, "t": np.asarray(sol.time_of(0))}
 
 
 def shape_of(sol: Solution) -> Shape:

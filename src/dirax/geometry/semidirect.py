@@ -78,30 +78,32 @@ class SemidirectProduct(eqx.Module):
         return jnp.concatenate([rotate(self.group, g, a[i : i + k]) for i in range(0, self.advected, k)])
 
     def refuse_no_representation(self, a: Advected) -> None:
-        """Raise `ValueError` where `representation` is not linear in a, or not one of the group: (gh)·a = g·(h·a). Asked once, of
-        concrete quantities of the size of a."""
+        """Raise `ValueError` where `representation` is not linear in a, or not one of the group: (gh)·a = g·(h·a) and e·a = a.
+        Asked once, of concrete quantities of the size of a."""
         if self.representation is None or is_traced(a):
             return
         size = float(np.max(np.abs(a), initial=0.0)) or 1.0
         key = type(self.group).__name__, self.advected, Same(self.representation)
         off, sizes = np.asarray(_asked.get(key, lambda: evaluated(self._missed, np.asarray(size))))
-        if np.max(off) <= KEPT * sizes[0]:
+        if not np.any(missed := ~(off <= KEPT * sizes)):
             return
-        law = ("linear in a", "one of the group, (gh)·a = g·(h·a)")[int(off[0] <= KEPT * sizes[0])]
+        law = ("linear in a", "one of the group, (gh)·a = g·(h·a)", "one of the group, e·a = a")[k := int(np.argmax(missed))]
         raise ValueError(
-            f"representation(matrix, a) is not {law}: it is off by {np.max(off):.2g} where its values are {sizes[0]:.2g}. It "
+            f"representation(matrix, a) is not {law}: it is off by {off[k]:.2g} where its values are {sizes[k]:.2g}. It "
             "says what g makes of a, of the matrix of g; that bodies see a as g⁻¹·a is seen to by dirax."
         )
 
-    def _missed(self, size: Any) -> Float[Array, "2 2"]:
-        """The most by which either law is missed at elements and quantities of one kind, and the size of the values."""
+    def _missed(self, size: Any) -> Float[Array, "2 3"]:
+        """The most by which each law is missed at elements and quantities of one kind, and the size of the values."""
         xi, eta = (jnp.cos(k + jnp.arange(1.0, self.dimension + 1.0)) for k in (0.0, 2.0))
         a, b = (size * jnp.cos(k + jnp.arange(1.0, self.advected + 1.0)) for k in (1.0, 4.0))
         g, h = self.group.group_exp(xi), self.group.group_exp(eta)
         whole = self.act(g, a + 2.0 * b)
         nonlinear = jnp.max(jnp.abs(whole - self.act(g, a) - 2.0 * self.act(g, b)))
         twice = jnp.max(jnp.abs(self.act(self.group.multiply(g, h), a) - self.act(g, self.act(h, a))))
-        return jnp.stack([jnp.stack([nonlinear, twice]), jnp.full(2, jnp.max(jnp.abs(whole)))])
+        unmoved = jnp.max(jnp.abs(self.act(self.group.identity(), a) - a))
+        of_whole = jnp.max(jnp.abs(whole))
+        return jnp.stack([jnp.stack([nonlinear, twice, unmoved]), jnp.stack([of_whole, of_whole, jnp.max(jnp.abs(a))])])
 
     def carried(self, g: Vector, a: Advected) -> Advected:
         """g⁻¹·a."""

@@ -65,7 +65,7 @@ class AbstractReducedSystem(AbstractSystem):
 
     @abstractmethod
     def sampled(self, data: Data, params: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Times, points and velocities, (1 + SAMPLES, …) each: the initial data, at t = 0, and random ones near them."""
+        """Times, points and velocities, (1 + SAMPLES, …) each: the initial data, and random ones near them at later times."""
 
     @abstractmethod
     def named(self, generator: int) -> str:
@@ -257,11 +257,11 @@ class ReducedLagrangeDirac(AbstractReducedSystem):
     def sampled(self, data: Data, params: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         q, units = np.asarray(data["q"] if "q" in data else data["q0"]), self._units(data, params)
         v = np.asarray(data["v"]) if "v" in data else units.v
-        return sampled_near(q, v, units, NEARBY, SAMPLES)
+        return sampled_near(q, v, units, NEARBY, SAMPLES, data.get("t", 0.0))
 
     def _units(self, data: Data, params: Any) -> SampleUnits:
         q = np.asarray(data["q"] if "q" in data else data["q0"])
-        return units_of(self.system, q, np.asarray(data["v"]) if "v" in data else np.zeros_like(q), params)
+        return units_of(self.system, q, np.asarray(data["v"]) if "v" in data else np.zeros_like(q), params, data.get("t", 0.0))
 
     def named(self, generator: int) -> str:
         return f"q[{self.connection.fibre[generator]}]"

@@ -60,7 +60,7 @@ class ReducedManifoldLagrangian(AbstractReducedSystem):
             return point, manifold.frame(point) @ (manifold.coordinates(q, v) + by[1])
 
         points, velocities = evaluated(lambda q, v, away: jax.vmap(near, in_axes=(None, None, 0))(q, v, away), q, v, away)
-        return times(1 + SAMPLES), np.asarray(points), np.asarray(velocities)
+        return np.asarray(data.get("t", 0.0)) + times(1 + SAMPLES), np.asarray(points), np.asarray(velocities)
 
     def named(self, generator: int) -> str:
         return f"generator {generator} of {self.connection.group}"

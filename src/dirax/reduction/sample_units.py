@@ -33,14 +33,16 @@ class SampleUnits(NamedTuple):
         return cls(np.ones(size), 1.0)
 
 
-def sample_units(value: Callable, constraints: Any, q: np.ndarray, v: np.ndarray, params: Any) -> SampleUnits:
-    """Those of a function value(q, v, params), a Lagrangian in coordinates or a discrete one, and of constraints, from their
-    numbers at (q, v). Equal functions and constraints are traced once."""
+def sample_units(value: Callable, constraints: Any, t: Any, q: np.ndarray, v: np.ndarray, params: Any) -> SampleUnits:
+    """Those of a function value(t, q, v, params), a Lagrangian in coordinates or a discrete one, and of constraints, from their
+    numbers at (t, q, v). Equal functions and constraints are traced once."""
     n = q.size
     if n > MOST:
         return SampleUnits.plain(n)
 
-    size, slope, bend, rows = (np.asarray(a) for a in evaluated(once(_numbers, value, constraints), q, v, params))
+    size, slope, bend, rows = (
+        np.asarray(a) for a in evaluated(once(_numbers, value, constraints), np.asarray(t, float), q, v, params)
+    )
     if not all(np.all(np.isfinite(a)) for a in (size, slope, bend, rows)):
         return SampleUnits.plain(n)
     time, energy, first = n, n + 1, n + 2
@@ -62,12 +64,12 @@ def sample_units(value: Callable, constraints: Any, q: np.ndarray, v: np.ndarray
     return SampleUnits(units[:n], float(units[time]))
 
 
-def _numbers(value: Callable, constraints: Any, q: Any, v: Any, params: Any) -> tuple:
-    """value(q, v, params), its first and second derivatives by (q, v), and the rows of the constraints."""
+def _numbers(value: Callable, constraints: Any, t: Any, q: Any, v: Any, params: Any) -> tuple:
+    """value(t, q, v, params), its first and second derivatives by (q, v), and the rows of the constraints."""
     n = q.size
-    of_both = lambda both: value(both[:n], both[n:], params)
+    of_both = lambda both: value(t, both[:n], both[n:], params)
     by_both, both = gradient(of_both), jnp.concatenate([q, v])
     rows = [jnp.zeros((0, n))]
     if constraints is not None and constraints.any:
-        rows.append(constraints.matrix(0.0, q, params))
+        rows.append(constraints.matrix(t, q, params))
     return of_both(both), by_both(both), jacobian(by_both)(both), jnp.concatenate(rows)

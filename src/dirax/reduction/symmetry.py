@@ -13,7 +13,6 @@ from dirax.numerics.ranks import numerical_rank
 from dirax.numerics.tolerances import SYMMETRY_DEFECT, TINY
 from dirax.program.evaluation.functions import in_numpy
 from dirax.program.memo import Same
-from dirax.program.tracing import once
 from dirax.program.user_functions import UserFunction
 from dirax.reduction.actions import AbstractAction
 from dirax.reduction.sample_units import SampleUnits, sample_units
@@ -62,14 +61,15 @@ def check_invariance(
     step: float | None = None,
     samples: int = 32,
     radius: float = 1.0,
+    t: float = 0.0,
 ) -> Invariance:
     """Whether L, the constraints and the forces of a Lagrangian system, or with `discrete_lagrangian(q0, q1, h[,
     params])` and `step` that function, are invariant under an action; and where not.
 
-    Looked at: `q` (n,) with `v` (n,) at t = 0, and `samples` random points within `radius` of them at other times, in units that
-    the numbers of L at (q, v) say (1 where lengths, masses and times are near 1); the group being connected, the derivative
-    along its generators decides. Points where L is not finite are left out. Raises `ValueError` for an action that is none, or
-    does not fit q.
+    Looked at: `q` (n,) with `v` (n,) at the time `t`, and `samples` random points within `radius` of them at later times, in
+    units that the numbers of L at (q, v) say (1 where lengths, masses and times are near 1); the group being connected, the
+    derivative along its generators decides. Points where L is not finite are left out. Raises `ValueError` for an action that is
+    none, or does not fit q.
     """
     if not isinstance(action, AbstractAction):
         raise TypeError(f"action must be one such as dx.Translations([0]) or dx.GroupAction(…), but {action!r} was given.")
@@ -79,43 +79,39 @@ def check_invariance(
     if discrete_lagrangian is None:
         check_lagrangian(system, q, v, params)
     if discrete_lagrangian is None:
-        units = units_of(system, q, v, params)
-        t, points, rates = sampled_near(q, v if given else units.v, units, radius, samples)
-        return invariance(system, action, t, points, rates, params, units)
+        units = units_of(system, q, v, params, t)
+        times, points, rates = sampled_near(q, v if given else units.v, units, radius, samples, t)
+        return invariance(system, action, times, points, rates, params, units)
     if step is None:
         raise ValueError("discrete_lagrangian needs step=, the h that it is called with.")
     ld = UserFunction(discrete_lagrangian, "discrete_lagrangian", ("q0", "q1", "h"), timed=True)
-    value = lambda q, v, params: ld(*ld.given(0.0, q, q + step * v, step, params))
-    units, functions = sample_units(value, None, q, v, params), {"discrete_lagrangian": ld}
-    t, points, rates = sampled_near(q, v if given else units.v, units, radius, samples)
-    return discrete_invariance(functions, action, t, points, points + step * rates, step, params, units)
+    value = lambda t, q, v, params: ld(*ld.given(t, q, q + step * v, step, params))
+    units, functions = sample_units(value, None, t, q, v, params), {"discrete_lagrangian": ld}
+    times, points, rates = sampled_near(q, v if given else units.v, units, radius, samples, t)
+    return discrete_invariance(functions, action, times, points, points + step * rates, step, params, units)
 
 
-def units_of(system: Any, q: np.ndarray, v: np.ndarray, params: Any) -> SampleUnits:
-    """The units at a point of a system with a Lagrangian in coordinates; 1 for any other."""
+def units_of(system: Any, q: np.ndarray, v: np.ndarray, params: Any, t: Any = 0.0) -> SampleUnits:
+    """The units at a point and a time of a system with a Lagrangian in coordinates; 1 for any other."""
     form: Any = with_lagrangian(system)
     if getattr(form, "lagrangian_form", lambda: None)() is not form:
         return SampleUnits.plain(q.size)
-    return sample_units(once(_at_time_zero, form.lagrangian), form.constraints, q, v, params)
-
-
-def _at_time_zero(lagrangian: UserFunction, q: Any, v: Any, params: Any) -> Any:
-    return lagrangian.at(0.0, q, v, params)
+    return sample_units(form.lagrangian.at, form.constraints, t, q, v, params)
 
 
 Samples: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Times (1 + samples,), points and velocities, (1 + samples, n) each."""
 
 
-def sampled_near(q: np.ndarray, v: np.ndarray, units: SampleUnits, radius: float, samples: int) -> Samples:
-    """(q, v) at t = 0, and random points and velocities within `radius` of them at random times, in these units."""
+def sampled_near(q: np.ndarray, v: np.ndarray, units: SampleUnits, radius: float, samples: int, t: Any = 0.0) -> Samples:
+    """(q, v) at the time t, and random points and velocities within `radius` of them at later times, in these units."""
     random = np.random.default_rng(0)
     away = lambda unit: np.concatenate([np.zeros((1, q.size)), radius * unit * random.uniform(-1, 1, (samples, q.size))])
-    return units.time * times(1 + samples), q + away(units.q), v + away(units.v)
+    return t + units.time * times(1 + samples), q + away(units.q), v + away(units.v)
 
 
 def times(count: int) -> np.ndarray:
-    """Times at which functions are looked at: 0, and random ones up to 1."""
+    """How long after the first time functions are looked at: 0, and random ones up to 1."""
     return np.random.default_rng(1).uniform(0, 1, count) * (np.arange(count) > 0)
 
 
@@ -276,18 +272,18 @@ def _worst(functions: dict[str, Callable], action: AbstractAction, t: Any, q: An
 
 
 def translation_symmetries(
-    system: Any, q: Any, v: Any = None, params: Any = None, samples: int = 64, radius: float = 1.0
+    system: Any, q: Any, v: Any = None, params: Any = None, samples: int = 64, radius: float = 1.0, t: float = 0.0
 ) -> np.ndarray:
     """Directions d, the rows of a (k, n) matrix with orthonormal rows, in which neither L nor constraints nor forces change
     (of the one-forms, their span; forces that see the multipliers are those of fixed ones, and then the one-forms themselves).
 
-    Found from ∂L/∂q at `samples` random points within `radius` of (q, v), in units as those of `check_invariance`;
-    `cyclic_coordinates` are those along the axes.
+    Found from ∂L/∂q at `samples` random points within `radius` of (q, v) at the time `t` and later, in units as those of
+    `check_invariance`; `cyclic_coordinates` are those along the axes.
     """
     system = with_lagrangian(system)
     q, v = checked_state(q, np.zeros_like if v is None else v)
     check_lagrangian(system, q, v, params)
-    units, random = units_of(system, q, v, params), np.random.default_rng(0)
+    units, random = units_of(system, q, v, params, t), np.random.default_rng(0)
     points = [c + radius * unit * random.uniform(-1, 1, (samples, q.size)) for c, unit in ((q, units.q), (v, units.v))]
     constraints = system.constraints
 
@@ -310,7 +306,7 @@ def translation_symmetries(
         slopes = [jnp.reshape(jax.jacfwd(function)(q), (-1, q.size)) * units.q[None] for function in along]
         return [jnp.hstack(pair) for pair in zip(values, slopes, strict=True)]
 
-    points = [np.asarray(a, float) for a in (units.time * random.uniform(0, 1, samples), *points)]
+    points = [np.asarray(a, float) for a in (t + units.time * random.uniform(0, 1, samples), *points)]
     found = in_numpy(at, points, Same(at), for_few=True) or jax.jit(jax.vmap(at))(*points)
     tables = [np.asarray(table) for table in found]
     finite = np.all([np.all(np.isfinite(table), axis=(1, 2)) for table in tables], axis=0)

@@ -36,7 +36,7 @@ class BatchPlan:
         self.jacobian = _scales(start.jacobian) if self.unknowns else None
         self.asks_hessian = asks_hessian(settings.system, shape, case)
         self.hessian: ScalarProgram | None = None
-        self.regular, self.premise = Regular(None if case.batch_params else case.params), KeptPremise(settings.system, case)
+        self.regular, self.premise = Regular(case), KeptPremise(settings.system, case)
 
     @property
     def whole(self) -> bool:
@@ -56,9 +56,8 @@ class BatchPlan:
         start: Start = _evaluated(self.begun, [*jax.tree.leaves(initial.data), *last])
         if not (self._holds(initial) and self._steps(start, case) and self._has_regular_hessian(initial, case, last[:-2])):
             return None
-        first, own = case.first if self.checks else ({}, None)
         for check in self.checks:
-            check(first, case.h, own)
+            check(case.begins, case.h, case.first[1])
         numbers = {"state": start.state, "guess": start.guess, "h": case.h, "t0": case.t0, "params": case.params}
         return self.template.with_numbers(**numbers, steps=steps, save_every=save_every)
 
@@ -83,7 +82,7 @@ class BatchPlan:
 
     def _has_regular_hessian(self, initial: Initial, case: Case, params: list[np.ndarray]) -> bool:
         """Whether ∂²L/∂v² is regular in the trajectories that the general way asks."""
-        if not self.asks_hessian or (not case.batch_params and case.params in self.regular):
+        if not self.asks_hessian or (not case.batch_params and case in self.regular):
             return True
         lanes = lanes_asked(case.batch or 1)
         q, v = (initial.data[name][lanes] for name in ("q", "v"))
@@ -95,13 +94,13 @@ class BatchPlan:
         t = np.full(len(lanes), case.t0)
         regular = all_surely_independent(self.hessian.in_numpy([t, q, v, *(leaf[lanes] for leaf in params)])[0], SURELY_REGULAR)
         if regular:
-            self.learn(case.params)
+            self.learn(case)
         return regular
 
-    def learn(self, params: Any) -> None:
-        """Note that the Lagrangian is regular for these params; those of a batch are others each time."""
-        if not self.template.batch_params:
-            self.regular.learn(params)
+    def learn(self, case: Case) -> None:
+        """Note that the Lagrangian is regular for the params and the time of this case; those of a batch are others each time."""
+        if not case.batch_params:
+            self.regular.learn(case)
 
 
 def _evaluated(program: tuple[ScalarProgram, Any], leaves: list[np.ndarray]) -> Any:

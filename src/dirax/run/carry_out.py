@@ -153,7 +153,7 @@ def carried_out(
     if kind is not None and not found.traced:
         kind.keep(numbers, case, found)
         if kind.plan is not None and found.plain:
-            kind.plan.learn(case.params)
+            kind.plan.learn(case)
         kind.runs += 1
         if kind.runs == 2:
             kind.plan = found.plan()
@@ -227,7 +227,7 @@ def _begun(settings: Settings, case: Case, steps: int, save_every: int, asked: i
     # user functions that close over a traced value make the start traced although nothing that was passed is
     if not (traced := traced or is_traced(start)):
         for stage in dict.fromkeys(stage.check for stage, _ in equation.stages):
-            stage(data, case.h, own)
+            stage(case.begins, case.h, own)
         needed = partial(needed_at, system, case, initial) if singular else None
         labels = equation.stages[0][0].labels
         shorter = lambda: begun(equation, replace(case, h=SHORTER * case.h), initial, by_jax).jacobian

@@ -57,7 +57,7 @@ class Plan:
         self.asks_hessian = asks_hessian(settings.system, shape, case)
         self.hessian: Floats | None = None
         self.places = _places(initial.data)
-        self.regular, self.premise = Regular(case.params), KeptPremise(settings.system, case)
+        self.regular, self.premise = Regular(case), KeptPremise(settings.system, case)
 
     @property
     def whole(self) -> bool:
@@ -82,7 +82,7 @@ class Plan:
         except (ArithmeticError, ValueError):  # what Python's floats do not have
             return None
         for check in self.checks:
-            check(case.data, case.h, case.params)
+            check(case.begins, case.h, case.params)
         guess, at = [], self.state_size
         for size in self.guesses:
             guess.append(np.array(start[at : at + size]))
@@ -123,8 +123,8 @@ class Plan:
         return math.isfinite(sum(found[:k])) and surely_independent(list(map(mul, found[k:], self.jacobian)), k)
 
     def _has_regular_hessian(self, complete: Sequence[float], case: Case, last: Sequence[float]) -> bool:
-        """Whether ∂²L/∂v² is regular; what is so once is not asked again for the same params."""
-        if not self.asks_hessian or case.params in self.regular:
+        """Whether ∂²L/∂v² is regular; what is so once is not asked again for the same params and time."""
+        if not self.asks_hessian or case in self.regular:
             return True
         q, v = (complete[self.places[name]] for name in ("q", "v"))
         if self.hessian is None:
@@ -136,12 +136,12 @@ class Plan:
         entries, n = self.hessian((case.t0, *q, *v, *last[:-2])), len(q)
         regular = surely_independent(entries, n, SURELY_REGULAR)
         if regular:
-            self.learn(case.params)
+            self.learn(case)
         return regular
 
-    def learn(self, params: Any) -> None:
-        """Note that the Lagrangian is regular for these params."""
-        self.regular.learn(params)
+    def learn(self, case: Case) -> None:
+        """Note that the Lagrangian is regular for the params and the time of this case."""
+        self.regular.learn(case)
 
 
 AnyPlan: TypeAlias = Plan | BatchPlan

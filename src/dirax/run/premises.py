@@ -20,23 +20,27 @@ SURELY_REGULAR = 1e6
 """Condition number of ∂²L/∂v², and of the matrix of the constraints, up to which there is no doubt of their rank."""
 
 REMEMBERED = 256
-"""Params for which it is remembered that the Lagrangian is regular."""
+"""Params and times for which it is remembered that the Lagrangian is regular."""
 
 
 class Regular:
-    """The params for which ∂²L/∂v² is known to be regular."""
+    """The params and first times for which ∂²L/∂v² is known to be regular, and the group of a reduced system to be a symmetry."""
 
-    def __init__(self, params: Any):
-        self._known = {bytes_of(params)}
+    def __init__(self, case: Case):
+        self._known = {self._key(case)}
 
-    def __contains__(self, params: Any) -> bool:
-        return bytes_of(params) in self._known
+    @staticmethod
+    def _key(case: Case) -> tuple:
+        return *bytes_of(case.params), case.t0
 
-    def learn(self, params: Any) -> None:
-        """Note that it is regular for these params."""
+    def __contains__(self, case: Case) -> bool:
+        return self._key(case) in self._known
+
+    def learn(self, case: Case) -> None:
+        """Note that it is so for this case."""
         if len(self._known) > REMEMBERED:
             self._known.clear()
-        self._known.add(bytes_of(params))
+        self._known.add(self._key(case))
 
 
 def check_premise(system: AbstractSystem, case: Case) -> None:
@@ -70,7 +74,7 @@ class KeptPremise:
         """Whether it holds; False where the general way is to say so. Raises `ValueError` where it does not hold."""
         if self.premise is None and not self.of_params:
             return True
-        if self.of_params and (case.batch_params or case.params not in regular):
+        if self.of_params and (case.batch_params or case not in regular):
             return False
         return all([self._holds(case, lane) for lane in ([0] if case.batch is None else lanes_asked(case.batch).tolist())])
 

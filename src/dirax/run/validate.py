@@ -61,6 +61,11 @@ class Case:
         """Data and parameters of the first trajectory."""
         return self.of(0)
 
+    @property
+    def begins(self) -> dict[str, Any]:
+        """The data of the first trajectory with the time t0: what the checks of a system and of a step are asked of."""
+        return {**self.of(0)[0], "t": np.asarray(self.t0)}
+
     def of(self, lane: int) -> tuple[dict[str, Any], Any]:
         """Data and parameters of one trajectory."""
         params = jax.tree.map(lambda leaf: leaf[lane], self.params) if self.batch_params else self.params

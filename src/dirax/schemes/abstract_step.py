@@ -65,7 +65,7 @@ class AbstractStep(ABC):
         """The arrays that are saved of the row that `state` is at."""
 
     def check(self, data: Data, h: Any, params: Any) -> None:
-        """Raise `ValueError` for initial data at which a premise of the method does not hold."""
+        """Raise `ValueError` for initial data, with the time `t`, at which a premise of the method does not hold."""
         return None
 
     def remark(self, state: Float[Array, " s"], t: Any, h: Any, params: Any) -> str:

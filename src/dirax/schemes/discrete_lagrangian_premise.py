@@ -34,8 +34,9 @@ class ConsistentWith:
         q, v = (np.asarray(data[name], float) for name in ("q", "v"))
         v = np.where(v == 0.0, np.max(np.abs(v)) or NEAR * np.max(np.abs(q)) / abs(h) or 1.0, v)
         q = np.where(q == 0.0, np.max(np.abs(q)) or abs(h) * np.max(np.abs(v)), q)
-        expected = self._numbers(self.slopes, (np.zeros(()), q, v, params))
-        near, closer = (self._near(q, v, step, params) for step in (NEAR * h, NEAR * h / CLOSER))
+        t = np.asarray(data.get("t", 0.0), float)
+        expected = self._numbers(self.slopes, (t, q, v, params))
+        near, closer = (self._near(t, q, v, step, params) for step in (NEAR * h, NEAR * h / CLOSER))
         if expected is None or near is None or closer is None:
             self.asked = True
             return
@@ -56,8 +57,8 @@ class ConsistentWith:
                 )
         self.asked = True
 
-    def _near(self, q: np.ndarray, v: np.ndarray, h: float, params: Any) -> tuple | None:
-        found = self._numbers(self.derivatives, (np.zeros(()), q, v, np.asarray(h), params))
+    def _near(self, t: np.ndarray, q: np.ndarray, v: np.ndarray, h: float, params: Any) -> tuple | None:
+        found = self._numbers(self.derivatives, (t, q, v, np.asarray(h), params))
         return None if found is None else (-found[0], found[1], (found[0] + found[1]) / h)
 
     @staticmethod

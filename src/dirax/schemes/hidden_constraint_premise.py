@@ -50,7 +50,7 @@ def nothing_hidden_in_lagrangian(system: LagrangeDirac | ManifoldLagrangian, equ
         if "p" in data:
             return None
         q, v = (data["q0"], (data["q1"] - data["q0"]) / h) if "q0" in data else (data["q"], data["v"])
-        return evaluated(hessian, np.zeros(()), q, v, params), "∂²L/∂v²", {"q": q, "v": v}
+        return evaluated(hessian, data.get("t", np.zeros(())), q, v, params), "∂²L/∂v²", {"q": q, "v": v}
 
     return _refusing(system, at, equation)
 

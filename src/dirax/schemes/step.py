@@ -92,8 +92,8 @@ class StepEquation(eqx.Module):
     may be given instead. `fields` says what is saved, `labels` names each row of the residual for messages, and `canonical`
     that the state is (q, p) of T*Q, so that its symplecticity can be measured. Optional are
 
-    - `check(data, h, params)`, which raises `ValueError` for initial data, concrete ones, at which a premise of the method
-      does not hold;
+    - `check(data, h, params)`, which raises `ValueError` for initial data, concrete ones with the time `t`, at which a premise
+      of the method does not hold;
     - `guess(state, previous, h, params) -> u`: where Newton's method starts, if that is not `previous` (k,), the unknowns
       extrapolated from the steps before;
     - `remark(state, t, h, params) -> str`, what there is to say of a place from which a step fails, or "";
