@@ -133,3 +133,14 @@ def test_collocation_of_a_singular_lagrangian_names_its_premise(scheme):
     start = {"q": [1.0, -0.25], "v": [0.0, 0.0]}
     with pytest.raises(ValueError, match=r"collocation takes regular Lagrangians, and ∂²L/∂v² is singular .*\.resolved\(\)"):
         dx.simulate(coupled, scheme, **start, step=0.1, steps=6)
+
+
+@pytest.mark.parametrize("scheme", [dx.PlusLagrangeDirac(), dx.LagrangeDAlembert(), dx.DiscreteDirac()])
+def test_lagrangians_that_determine_no_parametrization_are_refused(scheme):
+    """The metric of Jacobi of the Kepler problem: of degree one in v, so that ∂²L/∂v² v = 0. Errors of the discretization alone
+    make its steps regular, and points jumped by a hundred times h|v| with ok=True."""
+    jacobi = dx.LagrangeDirac(lambda q, v: jnp.sqrt(2.0 * (1.0 / jnp.sqrt(q @ q) - 0.5)) * jnp.sqrt(v @ v))
+    with pytest.raises(ValueError, match=r"they do not determine a motion: .*1 direction of ẋ undetermined"):
+        dx.simulate(jacobi, scheme, q=[0.8, 0.2], v=[0.3, 0.9], step=0.01, steps=40)
+    in_time = dx.LagrangeDirac(lambda t, q, v: -jnp.sqrt(1.0 - v @ v) - q @ q / 2)  # nonlinear in v, and regular
+    assert dx.simulate(in_time, scheme, q=[0.8, 0.2], v=[0.3, 0.9], step=0.01, steps=4).ok

@@ -109,9 +109,9 @@ class GroupAction(AbstractAction):
             raise ValueError(f"action(g, q) must return a point like q, of shape {q.shape}, but it returned shape {shape}.")
         g, h = random.normal(size=(2, self.size))
         here = np.asarray(q, float)
-        away = BESIDE * (float(np.max(np.abs(q))) or 1.0) * random.uniform(-1.0, 1.0, q.shape)
-        beside = act(0 * g, q + away)  # on the manifold, where the action is one of points of a manifold
-        for point in (q, beside):
+        away = BESIDE * (float(np.max(np.abs(here))) or 1.0) * random.uniform(-1.0, 1.0, here.shape)
+        beside = act(0 * g, here + away)  # on the manifold, where the action is one of points of a manifold
+        for point in (here, beside):
             for law, found, wanted in (
                 ("action(0, q) = q", act(0 * g, point), point),
                 ("action(g + h, q) = action(g, action(h, q))", act(g + h, point), act(g, act(h, point))),

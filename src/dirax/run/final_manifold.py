@@ -18,14 +18,14 @@ from dirax.program.user_functions import evaluated
 from dirax.run.start import Initial, completed
 from dirax.run.validate import Case
 from dirax.systems.constraint_algorithm import constraint_algorithm, final_manifold_needed
-from dirax.systems.constraint_chain import EMPTY, IRREGULAR, ConstraintChain
+from dirax.systems.constraint_chain import EMPTY, GAUGE, IRREGULAR, ConstraintChain
 from dirax.systems.shape import Shape
 from dirax.systems.system import AbstractSystem
 
 UPDATES = 30
 """Updates of Newton's method in the step that is tried."""
 
-MOVED = 2.0**-10
+MOVED = 2.0**-17
 """By how much of itself a velocity is changed to see whether its momentum follows."""
 
 MOST = 200
@@ -34,8 +34,9 @@ MOST = 200
 SEVERAL = 64
 """Trajectories of a batch that are asked, evenly spread."""
 
-DOUBTFUL = 1e-6
-"""Smallest singular value of that change, rows and columns scaled to 1, that leaves no doubt of a regular Lagrangian."""
+DOUBTFUL = 1e-4
+"""Smallest singular value of that change, rows and columns scaled to 1, that leaves no doubt of a regular Lagrangian: larger than
+what p that is not linear in v makes of the change, of the order of MOVED."""
 
 _chains: Memo[ConstraintChain | None] = Memo(64)
 
@@ -188,6 +189,12 @@ def _refuse_off(system: AbstractSystem, case: Case, initial: Initial, are: str, 
         singular = f"the Lagrangian is singular at the initial data{which} (∂²L/∂v²), and"
         if chain.verdict == EMPTY:
             raise ValueError(f"{singular} no motion passes through them: {chain.explanation[:-1].split(': ')[0]}.")
+        if chain.verdict == GAUGE:
+            raise ValueError(
+                f"{singular} they do not determine a motion: {chain.explanation[:-1]}. Steps through them, where they have a "
+                "unique solution at all, are made of errors of the discretization: state the Lagrangian of a given "
+                "parametrization, L(t, q, v) of one with regular ∂²L/∂v², or fix the gauge by a constraint."
+            )
         if off := chain.off_level(on_chain(chain, q, p, v, case.t0, params, q_alone), params):
             raise ValueError(
                 f"{singular} {are} off its final constraint manifold: {off}; {way}, or check_initial=False to take them as "
@@ -201,7 +208,7 @@ def _on_known_manifold(system: AbstractSystem, q: Any, p: Any, v: Any, t: float,
     leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(params)]
     key = by_value(system), jax.tree.structure(params), *((leaf.shape, (leaf != 0).tobytes()) for leaf in leaves)
     chain = _chains.get(key, lambda: chain_at(system, q, v, t, params))
-    if chain is None or chain.empty:
+    if chain is None or chain.empty or chain.verdict == GAUGE:
         return False
     x = on_chain(chain, q, p, v, t, params)
     value, slope = np.asarray(chain.constraints(x, params)), np.asarray(evaluated(slope_of(chain), x, params))
