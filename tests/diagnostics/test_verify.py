@@ -781,3 +781,27 @@ def test_what_equations_do_to_the_energy_is_measured_where_they_alone_say_it(way
         moves = len(netlist) != 2 or netlist[0][0] == "R"
         assert report.ok and report["energy"].verdict == ("not checked" if moves else "bounded"), netlist
         assert ("by its own equations, at a rate of up to" in report["energy"].explanation) == moves
+
+
+@pytest.mark.parametrize("kind", ["a Hamiltonian", "a submanifold"])
+def test_the_rows_of_a_large_two_form_have_its_roundings(kind):
+    """Those of a strong magnetic field, which constrain nothing, were called VIOLATED by 10⁻¹². A third coordinate without a
+    velocity is constrained, and that by no more than its own terms say."""
+    big, turn = 1e4, np.array([[0.0, -1.0], [1.0, 0.0]])
+    form = np.block([[big * turn, -np.eye(2)], [np.eye(2), np.zeros((2, 2))]])
+
+    def run(form, hamiltonian, x, scheme):
+        structure = dx.DiracStructure.from_two_form(lambda x: jnp.asarray(form) * 1.0)
+        if kind == "a submanifold":
+            submanifold = dx.LagrangianSubmanifold.from_hamiltonian(hamiltonian)
+            system = dx.GeneralizedDiracSystem(structure, submanifold)
+        else:
+            system = dx.DiracSystem(structure, hamiltonian)
+        return dx.simulate(system, scheme, x=x, step=0.5 / big, steps=200)
+
+    sol = run(form, lambda x: x @ x / 2 + 0.1 * x[0] ** 4, [0.5, 0.3, 0.2, 0.4], dx.Collocation(2))
+    assert dx.verify(sol)["constraint"].verdict == "ok"
+    sol = run(np.pad(big * turn, ((0, 1), (0, 1))), lambda x: x @ x / 2, [0.5, 0.3, 0.0], dx.DiscreteDirac())
+    assert dx.verify(sol)["constraint"].verdict == "ok"
+    moved = np.asarray(sol.x) + np.array([0.0, 0.0, 1e-13])
+    assert dx.verify(changed(sol, fields=sol.fields | {"x": moved}))["constraint"].value > 1e-13

@@ -115,13 +115,19 @@ def _constraint_scale(sol: Solution, structure: AbstractDiscreteStructure | str,
         return float(max(np.nanmax(np.abs(a)) for a in nodes)) or TINY
     form = sol.system.lagrangian_form()
     if sol.system.constrains_differential:
-        return float(np.nanmax(sampled_terms(sol, at_rows(sol, energy_at)))) or TINY
+        size = float(np.nanmax(sampled_terms(sol, at_rows(sol, energy_at)))) or TINY
+        return np.maximum(size, _constraint_sizes(sol, axis=(0, 1)))
     if form is not None and form.constraints.any and "p" in sol.fields:
         return _largest(sampled(sol, at_rows(sol, _constraint_terms, form)))[:count]  # steps say no hidden ones
     size = float(np.nanmax(sampled_terms(sol, at_rows(sol, constraint_at))))
-    if sol.system.has_constraint_sizes:
-        size = max(size, float(np.nanmax(sampled(sol, at_rows(sol, _sizes_at)), initial=0.0)))
-    return size or TINY
+    return max(size, float(_constraint_sizes(sol))) or TINY
+
+
+def _constraint_sizes(sol: Solution, axis: tuple[int, int] | None = None) -> Any:
+    """The largest that the system says of all constraints and rows, or of the rows alone by `axis`; 0 where it says none."""
+    if sol.system is None or not sol.system.has_constraint_sizes:
+        return 0.0
+    return np.nanmax(sampled(sol, at_rows(sol, _sizes_at)), axis=axis, initial=0.0)
 
 
 def _sizes_at(system: Any, row: dict, params: Any):

@@ -346,3 +346,14 @@ class DiracSystem(AbstractSystem):
     @property
     def constrains_differential(self) -> bool:
         return self.holonomic is None
+
+    @property
+    def has_constraint_sizes(self) -> bool:
+        return self.holonomic is None
+
+    def constraint_sizes_at(self, row: Data, params: Any) -> Float[Numbers, " k"]:
+        """The terms of F ẋ + E dH: those of a two-form cancel, and are as large as it is."""
+        x = row["x"]
+        F, E = (jnp.abs(jnp.asarray(a)) for a in self.structure.kernel(x, params))
+        velocity = self.complete({"x": x}, params, False)["velocity"]
+        return F @ jnp.abs(velocity) + E @ jnp.abs(self.differential(x, params))

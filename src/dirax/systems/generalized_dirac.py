@@ -186,3 +186,15 @@ class GeneralizedDiracSystem(AbstractSystem):
     @property
     def constrains_differential(self) -> bool:
         return True
+
+    @property
+    def has_constraint_sizes(self) -> bool:
+        return True
+
+    def constraint_sizes_at(self, row: Data, params: Any) -> Float[Numbers, " N+k"]:
+        """The terms of F ẋ + E ∂F/∂x: those of a two-form cancel, and are as large as it is. Of ∂F/∂s no more is known."""
+        found = self._found(row, params)
+        F, E = (jnp.abs(jnp.asarray(a)) for a in self.structure.kernel(found["x"], params))
+        covector = self.submanifold.covector(found["x"], found["guess"], params)
+        terms = F @ jnp.abs(found["velocity"]) + E @ jnp.abs(covector)
+        return jnp.concatenate([terms, jnp.zeros(self.submanifold.parameters)])
