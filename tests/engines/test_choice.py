@@ -8,6 +8,7 @@ import pytest
 
 import dirax as dx
 from dirax.engines import policy as choice
+from dirax.engines import step_program as module_of_steps
 from dirax.engines.step_program import step_program
 from dirax.program.interpreter import UnsupportedPrimitive
 
@@ -56,12 +57,24 @@ def test_operations_do_not_matter_where_an_array_program_would_be_far_larger(nes
 
 def test_a_step_whose_elimination_is_too_large_goes_to_arrays(monkeypatch):
     """Its residual is small enough to be traced, which is all that the native engine says before it writes the kernel."""
-    from dirax.engines.native import kernels
-
-    monkeypatch.setattr(kernels, "NODE_LIMIT", 150)
+    monkeypatch.setattr(module_of_steps, "NODE_LIMIT", 150)
+    monkeypatch.setattr(choice, "MOST_TRACED", 0)
     system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - jnp.sum(jnp.cos(q[:, None] - q[None, :] * 0.7)))
     run = {"q": np.linspace(0.1, 0.5, 4), "v": np.zeros(4), "step": 0.05, "steps": 5}
     sol = dx.simulate(system, dx.LagrangeDAlembert(), **run)
     assert sol.ok and sol.stats["engine"] == "xla" and "more than 150 scalar operations" in sol.stats["not_native"]
     with pytest.raises(UnsupportedPrimitive, match="more than 150 scalar operations"):
         dx.simulate(system, dx.LagrangeDAlembert(), **run, engine="native")
+
+
+def test_a_large_step_that_takes_xla_longer_is_traced_further(monkeypatch):
+    """Of more scalar operations than a limit, and many more operations on arrays than a chain with as many."""
+    monkeypatch.setattr(module_of_steps, "NODE_LIMIT", 1000)
+    turned = lambda q: jnp.stack([jnp.sin(q[i]) * jnp.cos(q[(i + 1) % 6]) for i in range(6)])
+    written = dx.LagrangeDirac(lambda q, v: v @ v / 2 + turned(turned(turned(q))) @ turned(q))
+    run = {"q": np.linspace(0.1, 0.9, 6), "v": np.zeros(6), "step": 0.01, "steps": 3}
+    sol = dx.simulate(written, dx.LagrangeDAlembert(), **run)
+    assert sol.stats["engine"] == "native" and sol.stats["operations"] > 1000
+    pairs = potential(lambda q: q[:, None] - q[None, :])
+    of_arrays = dx.simulate(pairs, dx.LagrangeDAlembert(), **RUN)
+    assert of_arrays.stats["engine"] == "xla" and "scalar operations" in of_arrays.stats["not_native"]

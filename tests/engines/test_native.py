@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import dirax as dx
+from dirax.engines import policy, step_program
 from dirax.engines.contract import NOT_CONVERGED, NOT_FINITE, OK, Problem
 from dirax.engines.native import Native, at_once, shared
 from dirax.engines.native import kernels as of_steps
@@ -411,7 +412,8 @@ def test_a_step_near_the_limit_of_nodes_has_its_sizes_and_derivatives(monkeypatc
     monkeypatch.setattr(of_steps.Kernels, "_planned", with_its_nodes)
     monkeypatch.setenv("DIRAX_CACHE", "off")
     free = run(1.5), jax.grad(lambda k: jnp.sum(run(k).q ** 2))(1.5)
-    monkeypatch.setattr(of_steps, "NODE_LIMIT", max(nodes.values()))
+    monkeypatch.setattr(step_program, "NODE_LIMIT", max(nodes.values()))
+    monkeypatch.setattr(policy, "MOST_TRACED", 0)
     monkeypatch.setattr(of_steps, "SIZING", 0.0)
     dx.clear_caches()
     for k in (1.0, 1.1, 1.2):

@@ -82,6 +82,10 @@ SCALARS_FOR_ARRAYS = 5
 the native engine a step of more than MOST_OPERATIONS where XLA would take longer. The bicycle by Method 2 has 31 900 and 48 100:
 4 s and 60 s to the first result, and 14 µs and 5.5 ms a step."""
 
+MOST_TRACED, LEFT_OUT = 200_000, 2
+"""Scalar operations up to which a step is traced where XLA would take longer, and how many there are for one that is left when
+what nothing needs is left out: a rod of two rigid bodies in space has 111 000 and 96 365, compiled in 5 s, XLA takes 65."""
+
 MOST_FOR_XLA = 6000
 """Scalar operations of a residual with its Jacobian up to which XLA is given them: it takes some milliseconds to compile each."""
 
@@ -102,6 +106,11 @@ def kept_from_native(problem: Problem, traced: bool = False) -> str | None:
 def most_operations(problem: Problem) -> int | None:
     """Scalar operations of a step up to which "auto" takes the native engine; None for any number."""
     return None if problem.size <= LARGEST_FULL else MOST_OPERATIONS
+
+
+def most_traced(array_operations: float) -> int:
+    """Scalar operations up to which an equation is traced that takes so many operations on arrays."""
+    return min(MOST_TRACED, int(LEFT_OUT * SCALARS_FOR_ARRAYS * array_operations))
 
 
 def small_for_scalars(problem: Problem) -> bool:

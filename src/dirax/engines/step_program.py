@@ -102,7 +102,8 @@ def _nodes(
         leaves.append(ids(shared.params[at : at + count], shape))
         at += count
     arguments = [ids(unknowns), ids(state), ids(previous), ids(shared.t, ()), ids(shared.h, ()), *leaves]
-    program = ScalarProgram(g, arguments)
+    program, for_arrays = ScalarProgram(g, arguments), array_operations(closed.jaxpr, policy.MORE_FOR_XLA)
+    g.limit = max(g.limit, len(g) + policy.most_traced(for_arrays))
     try:
         program.run(closed, rules)
     except GraphTooLarge as error:
@@ -113,7 +114,7 @@ def _nodes(
     return TracedEquation(
         state, unknowns, previous, guess.tolist(), residual.tolist(), advance.tolist(),
         dict(zip(names, rows, strict=True)), nesting(closed.jaxpr),
-        array_operations(closed.jaxpr, policy.MORE_FOR_XLA), closed, weak,
+        for_arrays, closed, weak,
     )  # fmt: skip
 
 

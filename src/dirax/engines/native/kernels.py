@@ -21,7 +21,7 @@ from dirax.engines.newton_step import newton_corrections
 from dirax.engines.step_program import KEPT, StepProgram, step_program
 from dirax.program import graph as graph_module
 from dirax.program import machine_code as llvm
-from dirax.program.graph import NODE_LIMIT, Graph, GraphTooLarge
+from dirax.program.graph import Graph, GraphTooLarge
 from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.program.memo import Memo, Same
 
@@ -188,7 +188,7 @@ class Kernels:
             step = self.step
             try:
                 _ = step.jacobians
-                g = step.graph.copy(NODE_LIMIT)  # with its Jacobians
+                g = step.graph.copy(step.graph.limit)  # with its Jacobians
                 plan = self._plan(g)
                 plan.corrections = [newton_corrections(g, step, i, self.whole) for i in range(len(step.equations))]
                 if self.compensated:
