@@ -98,7 +98,7 @@ def _constraint_terms(system: LagrangeDirac, row: dict, params: Any):
 
 def _largest(*sizes: np.ndarray) -> np.ndarray:
     """The sums of sizes (B, rows, …), the largest of each over all rows."""
-    found = sum(np.nanmax(size, axis=(0, 1)) for size in sizes)
+    found = sum(np.nanmax(size, axis=(0, 1), initial=0.0) for size in sizes)
     return np.where(found > 0, found, TINY)
 
 
@@ -116,18 +116,16 @@ def _constraint_scale(sol: Solution, structure: AbstractDiscreteStructure | str,
     form = sol.system.lagrangian_form()
     if sol.system.constrains_differential:
         size = float(np.nanmax(sampled_terms(sol, at_rows(sol, energy_at)))) or TINY
-        return np.maximum(size, _constraint_sizes(sol, axis=(0, 1)))
+        return np.maximum(size, _constraint_sizes(sol))
     if form is not None and form.constraints.any and "p" in sol.fields:
         return _largest(sampled(sol, at_rows(sol, _constraint_terms, form)))[:count]  # steps say no hidden ones
     size = float(np.nanmax(sampled_terms(sol, at_rows(sol, constraint_at))))
-    return max(size, float(_constraint_sizes(sol))) or TINY
+    return max(size, float(np.max(_constraint_sizes(sol), initial=0.0))) or TINY
 
 
-def _constraint_sizes(sol: Solution, axis: tuple[int, int] | None = None) -> Any:
-    """The largest that the system says of all constraints and rows, or of the rows alone by `axis`; 0 where it says none."""
-    if sol.system is None or not sol.system.has_constraint_sizes:
-        return 0.0
-    return np.nanmax(sampled(sol, at_rows(sol, _sizes_at)), axis=axis, initial=0.0)
+def _constraint_sizes(sol: Solution) -> Any:
+    """What the system says of each constraint, the largest over all rows; 0 where it says nothing."""
+    return _largest(sampled(sol, at_rows(sol, _sizes_at))) if sol.system and sol.system.has_constraint_sizes else 0.0
 
 
 def _sizes_at(system: Any, row: dict, params: Any):

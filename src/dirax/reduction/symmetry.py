@@ -78,17 +78,16 @@ def check_invariance(
     action.check(jnp.asarray(q))
     if discrete_lagrangian is None:
         check_lagrangian(system, q, v, params)
-    if discrete_lagrangian is None:
         units = units_of(system, q, v, params, t)
-        times, points, rates = sampled_near(q, v if given else units.v, units, radius, samples, t)
-        return invariance(system, action, times, points, rates, params, units)
+        near = sampled_near(q, v if given else units.v, units, radius, samples, t)
+        return invariance(system, action, *near, params, units)
     if step is None:
         raise ValueError("discrete_lagrangian needs step=, the h that it is called with.")
     ld = UserFunction(discrete_lagrangian, "discrete_lagrangian", ("q0", "q1", "h"), timed=True)
     value = lambda t, q, v, params: ld(*ld.given(t, q, q + step * v, step, params))
     units, functions = sample_units(value, None, t, q, v, params), {"discrete_lagrangian": ld}
-    times, points, rates = sampled_near(q, v if given else units.v, units, radius, samples, t)
-    return discrete_invariance(functions, action, times, points, points + step * rates, step, params, units)
+    when, points, rates = sampled_near(q, v if given else units.v, units, radius, samples, t)
+    return discrete_invariance(functions, action, when, points, points + step * rates, step, params, units)
 
 
 def units_of(system: Any, q: np.ndarray, v: np.ndarray, params: Any, t: Any = 0.0) -> SampleUnits:

@@ -56,8 +56,9 @@ class BatchPlan:
         start: Start = _evaluated(self.begun, [*jax.tree.leaves(initial.data), *last])
         if not (self._holds(initial) and self._steps(start, case) and self._has_regular_hessian(initial, case, last[:-2])):
             return None
+        first, own = case.begins() if self.checks else ({}, None)
         for check in self.checks:
-            check(case.begins, case.h, case.first[1])
+            check(first, case.h, own)
         numbers = {"state": start.state, "guess": start.guess, "h": case.h, "t0": case.t0, "params": case.params}
         return self.template.with_numbers(**numbers, steps=steps, save_every=save_every)
 

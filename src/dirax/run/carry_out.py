@@ -226,8 +226,9 @@ def _begun(settings: Settings, case: Case, steps: int, save_every: int, asked: i
     start = begun(equation, case, initial, by_jax)
     # user functions that close over a traced value make the start traced although nothing that was passed is
     if not (traced := traced or is_traced(start)):
-        for stage in dict.fromkeys(stage.check for stage, _ in equation.stages):
-            stage(case.begins, case.h, own)
+        first = case.begins()[0]
+        for check in dict.fromkeys(stage.check for stage, _ in equation.stages):
+            check(first, case.h, own)
         needed = partial(needed_at, system, case, initial) if singular else None
         labels = equation.stages[0][0].labels
         shorter = lambda: begun(equation, replace(case, h=SHORTER * case.h), initial, by_jax).jacobian

@@ -82,7 +82,7 @@ class Plan:
         except (ArithmeticError, ValueError):  # what Python's floats do not have
             return None
         for check in self.checks:
-            check(case.begins, case.h, case.params)
+            check(case.begins()[0], case.h, case.params)
         guess, at = [], self.state_size
         for size in self.guesses:
             guess.append(np.array(start[at : at + size]))

@@ -46,9 +46,7 @@ class Regular:
 def check_premise(system: AbstractSystem, case: Case) -> None:
     """Raise `ValueError` where the premise of the system does not hold in a trajectory of those that are asked."""
     for lane in lanes_asked(case.batch or 1).tolist():
-        data, params = case.of(lane)
-        data["t"] = np.asarray(case.t0)
-        system.check(data, params)
+        system.check(*case.begins(lane))
 
 
 class KeptPremise:
@@ -62,7 +60,7 @@ class KeptPremise:
         self.known: tuple[float, ...] | None = None
         if found is None:
             return
-        values = self._values(case, 0)
+        values = case.begins()
         program = program_at(found.numbers, values)
         numbers = jax.eval_shape(found.numbers, *values)
         leaves, self.structure = jax.tree.flatten(numbers)
@@ -82,7 +80,7 @@ class KeptPremise:
         if self.premise is None or self.program is None:
             return False
         try:
-            found = self.program([x for leaf in jax.tree.leaves(self._values(case, lane)) for x in leaf.ravel().tolist()])
+            found = self.program([x for leaf in jax.tree.leaves(case.begins(lane)) for x in leaf.ravel().tolist()])
         except (ArithmeticError, ValueError):  # what Python's floats do not have
             return False
         if found != self.known:
@@ -90,10 +88,6 @@ class KeptPremise:
             self.premise.refuse(jax.tree.unflatten(self.structure, arrays))
             self.known = found
         return True
-
-    def _values(self, case: Case, lane: int) -> tuple[dict[str, Any], Any]:
-        data, params = case.of(lane) if case.batch is not None else (case.data, case.params)
-        return {**data, "t": np.asarray(case.t0)}, params
 
 
 def bytes_of(params: Any) -> tuple:

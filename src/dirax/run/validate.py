@@ -61,10 +61,10 @@ class Case:
         """Data and parameters of the first trajectory."""
         return self.of(0)
 
-    @property
-    def begins(self) -> dict[str, Any]:
-        """The data of the first trajectory with the time t0: what the checks of a system and of a step are asked of."""
-        return {**self.of(0)[0], "t": np.asarray(self.t0)}
+    def begins(self, lane: int = 0) -> tuple[dict[str, Any], Any]:
+        """Data with the time t0, and parameters, of one trajectory: what the checks of a system and of a step are asked of."""
+        data, params = self.of(lane)
+        return {**data, "t": np.asarray(self.t0)}, params
 
     def of(self, lane: int) -> tuple[dict[str, Any], Any]:
         """Data and parameters of one trajectory."""

@@ -325,13 +325,14 @@ def root(made: ScalarProgram, interpreter: Interpreter, equation: Any, *operands
 
     axes, (result,) = equation.params["axes"], [v.aval.shape for v in equation.outvars]
     given = [*closed.in_avals[:-1], closed.out_avals[0]]  # the guess has the shape of the residual
-    lead, k = result[: len(axes)], math.prod(closed.out_avals[0].shape)
+    lead = result[: len(axes)]
 
     def side_by_side(arrays: list[np.ndarray]) -> list[np.ndarray]:
         entries, count = len(arrays[0]), len(arrays[0]) * math.prod(lead)
         one = [a.reshape(count, *aval.shape) for a, aval in zip(arrays, given, strict=True)]
         found = lambda: in_parts(find, one, most)[0].reshape(entries, *result)
-        return [_kept((Same(closed), equation.params["max_steps"], equation.params["strict"], lead), one, found, count * k)]
+        what = Same(closed), equation.params["max_steps"], equation.params["strict"], lead
+        return [_kept(what, one, found, entries * math.prod(result))]
 
     return made.between([_in_front(nodes, axes, k, lead) for k, nodes in enumerate(operands)], [result], side_by_side)
 
