@@ -691,6 +691,27 @@ def test_half_a_recurrence_of_a_chain_is_no_drift():
     assert verdicts == ["not checked", "not checked", "bounded"]
 
 
+def in_a_strong_field(q, v):
+    return v @ v / 2 + 50 * (q[0] * v[1] - q[1] * v[0]) - q @ q / 2 - 0.1 * q[0] ** 4
+
+
+def test_a_guiding_centre_that_has_not_turned_back_is_no_drift():
+    """The error of the energy follows the guiding centre, which goes round once in 125 000 of these steps."""
+    system, start = dx.LagrangeDirac(in_a_strong_field), {"q": [0.5, 0.3], "v": [0.2, 0.4]}
+    run = lambda scheme, **more: energy_line(dx.simulate(system, scheme, step=0.005, **more, **start))
+    short, longer = (run(dx.LagrangeDAlembert(), steps=2000 * every, save_every=every) for every in (1, 60))
+    assert short.verdict == "not checked"
+    assert "parts of it go one way" in short.explanation
+    assert longer.verdict == "bounded"
+
+
+def test_parts_that_go_one_way_hide_no_drift_that_is_not_far_smaller():
+    slow, drift = 0.01 * TIMES, np.sin(TIMES) + 3e-2 * TIMES
+    parts = lambda factor: lambda: (TIMES, factor * np.stack([slow, drift], axis=1))
+    assert judge(TIMES, drift, MOTION, 1e-12, None, parts(1.0)).verdict == "drifts"
+    assert judge(TIMES, drift, MOTION, 1e-12, None, parts(1000.0)).verdict == "not checked"
+
+
 def test_the_plot_has_a_bar_a_line_in_the_colour_of_its_verdict():
     """The bars end at the measured values; zero, infinity and nothing have a place on a logarithmic axis, too."""
     cases = [(1e-16, 1e-14, "ok"), (0.0, 1e-14, "ok"), (0.5, 1e-3, "VIOLATED"), (1e-5, 1e-2, "bounded"), (2.0, 1e-2, "drifts")]

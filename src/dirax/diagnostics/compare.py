@@ -3,6 +3,7 @@
 import time as clock
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,7 +11,7 @@ import numpy as np
 from dirax.diagnostics.bench.subject import Skipped
 from dirax.diagnostics.convergence import convergence, refuse_tolerance, simulated
 from dirax.diagnostics.drift import judge
-from dirax.diagnostics.energy_lines import energy_less_work, energy_scale
+from dirax.diagnostics.energy_lines import energy_less_work, energy_parts, energy_scale
 from dirax.diagnostics.explicit_solution import ExplicitSolution, explicit_solution
 from dirax.numerics.arrays import is_whole
 from dirax.numerics.tolerances import EPSILON
@@ -209,8 +210,10 @@ def _entry(name: str, sol: Solution, order, precision, note: str, seconds: float
         motion = np.asarray(sol.fields["q"] if "q" in sol.fields else sol.fields["x"])
         size = energy_scale(sol, energy)
         roundoff = 8 * EPSILON * np.sqrt(steps) * size
-        finite = np.all(np.isfinite(energy))
-        drift = "not finite" if not finite else "not checked" if changes else judge(sol.t, energy, motion, roundoff, size).verdict
+        if not np.all(np.isfinite(energy)):
+            drift = "not finite"
+        elif not changes:
+            drift = judge(sol.t, energy, motion, roundoff, size, partial(energy_parts, sol)).verdict
     constraint = np.asarray(sol.constraint_residual())
     return Entry(
         scheme=name,

@@ -12,7 +12,9 @@ If it is bounded, these means scatter inside the band that every window shows; i
 
 A motion that has not settled is no sign of one: the energy error of a scheme that keeps a structure is a function of the state,
 and where squares of coordinates themselves drift, by UNSETTLED times more than the energy, it may follow them. A chain of Fermi,
-Pasta, Ulam and Tsingou over half of its recurrence looks like a drift, and eight of them show that there is none.
+Pasta, Ulam and Tsingou over half of its recurrence looks like a drift, and eight of them show that there is none. So it is where
+parts of the energy have a trend of their own that is so much larger, as while the slow motion of a charge's guiding centre has
+not turned back yet.
 
 Each is asked for three numbers of windows, and must hold for all, so that no oscillation in step with the windows passes.
 A series is judged only after the motion has gone through a few oscillations: before, nothing can tell a drift from one.
@@ -22,6 +24,7 @@ Hénon–Heiles, double pendulums regular and chaotic, chains, beats, the rollin
 of explicit Euler and Runge–Kutta runs and of the disk's one-sided schemes 96 % were.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -68,9 +71,11 @@ def judge(
     motion: Float[np.ndarray, "N d"],
     roundoff: float,
     size: float | None = None,
+    parts: Callable[[], tuple[np.ndarray, np.ndarray]] | None = None,
 ) -> Judgement:
     """The Judgement of `series` at the times `t`, of a system that moves as `motion`; changes below `roundoff` are none. The
-    terms of the series are of the `size`, by default the largest value."""
+    terms of the series are of the `size`, by default the largest value. `parts` returns times (n,) and (n, parts): series that
+    this one is made of, which are asked for where it would be called a drift."""
     if len(series) < 2:
         return Judgement(NOT_CHECKED, "fewer than two rows were computed", 0.0, roundoff)
     width = float(np.ptp(series))
@@ -91,6 +96,12 @@ def judge(
         text = (
             f"it moved by {width:.2g}, {rate}, while squares of the coordinates drift as well, and by far more: a longer run "
             "shows whether it follows them, or drifts"
+        )
+    elif (goes or leaves) and parts is not None and part_of_trend(*parts(), UNSETTLED * abs(found.drift)):
+        verdict = NOT_CHECKED
+        text = (
+            f"it moved by {width:.2g}, {rate}, while parts of it go one way as well, and by far more: a longer run shows whether "
+            "it follows them, or drifts"
         )
     elif goes:
         verdict, text = DRIFTS, f"steady trend of {rate}, out of a band of {found.band:.2g}"
@@ -122,6 +133,14 @@ def unsettled(motion: Float[np.ndarray, "N d"], least: float, steadily: bool) ->
     gone = np.ptp(quarters, axis=0) > max(NOTICEABLE, least)
     gone = gone & (back >= -TURNING_BACK * np.abs(way)) if steadily else gone
     return bool(np.sum(gone) >= SHARE * max(len(way), 1))
+
+
+def part_of_trend(t: np.ndarray, parts: np.ndarray, least: float) -> bool:
+    """Whether one of the series `parts` (n, parts) at the times `t` has a trend that goes further than `least`."""
+    if len(t) < SMALLEST_SERIES:
+        return False
+    wide = np.ptp(parts, axis=0) > least
+    return any(found.trend and abs(found.drift) > least for found in (analyse(t, part) for part in parts.T[wide]))
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """Lines of `dx.verify` on the energy and on the books of ports."""
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -8,7 +9,7 @@ from dirax.diagnostics.drift import judge
 from dirax.diagnostics.energy_jumps import NOTICED, energy_jump
 from dirax.diagnostics.power_balance import balances, has_power, keeps_books
 from dirax.diagnostics.report import BOUNDED, DRIFTS, NOT_CHECKED, VIOLATED, Line
-from dirax.diagnostics.rows import LARGE, at_rows, energy_at, energy_of, power_at, row_numbers
+from dirax.diagnostics.rows import LARGE, at_rows, energy_at, energy_of, over_rows, power_at, row_numbers
 from dirax.diagnostics.verdicts import ROUNDINGS, of_lane, sampled, sampled_terms, spread, steps_of
 from dirax.numerics.tolerances import EPSILON
 from dirax.schemes.energy_collocation_step import NOTICED as DEFECT
@@ -26,6 +27,9 @@ POWER = 1e-9
 
 SITES = 64
 """Numbers of each field that show how fast a large system moves."""
+
+PARTS_AT = 2000
+"""Rows, evenly spread, at which the parts of an energy are looked at."""
 
 
 def energy_less_work(sol: Solution) -> tuple[np.ndarray, bool, str]:
@@ -66,7 +70,8 @@ def energy_line(sol: Solution) -> Line:
     times, found = sol.times, []
     for lane, series in enumerate(energy):
         good = np.isfinite(series)
-        found.append(judge(times[lane][good], series[good], _motion(sol, lane)[good], roundoff, size))
+        parts = partial(energy_parts, sol, lane)
+        found.append(judge(times[lane][good], series[good], _motion(sol, lane)[good], roundoff, size, parts))
     order = (NOT_CHECKED, BOUNDED, DRIFTS)
     lane = max(range(len(found)), key=lambda i: (order.index(found[i].verdict), abs(found[i].drift)))
     worst = found[lane]
@@ -180,6 +185,27 @@ def _motion(sol: Solution, lane: int) -> np.ndarray:
     if row_numbers(sol) > LARGE:  # some of the sites
         return np.concatenate([np.asarray(a[:, spread(a.shape[1], SITES)]).reshape(len(a), -1) for a in rows], axis=1)
     return np.concatenate([np.asarray(a).reshape(len(a), -1) for a in rows], axis=1)
+
+
+def energy_parts(sol: Solution, lane: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """What each number of a row has to do with the energy of a trajectory: times (n,), and (n, numbers) the energy less what it
+    were with this number as at the start. Nothing of a large system."""
+    count = int(np.sum(np.isfinite(energy_of(sol).reshape(-1, sol.rows)[lane])))
+    rows = np.unique(np.linspace(0, count - 1, min(count, PARTS_AT)).astype(int))
+    times = sol.times[lane][rows]
+    if sol.system is None or row_numbers(sol) > LARGE:
+        return times, np.zeros((len(rows), 0))
+    one = sol if sol.batch is None else sol[lane]
+    nodes = {name: np.asarray(a)[rows] for name, a in one.row_fields.items()}
+    energies = lambda: over_rows(at_rows(one, energy_at), one, (nodes,))[0]
+    energy, found = energies(), []
+    for name, values in nodes.items():
+        for i in np.ndindex(values.shape[1:]):
+            nodes[name] = np.array(values)
+            nodes[name][:, *i] = values[0, *i]
+            found.append(energy - energies())
+        nodes[name] = values
+    return times, np.nan_to_num(np.stack(found, axis=1))
 
 
 def energy_scale(sol: Solution, energy: np.ndarray) -> float:

@@ -11,6 +11,9 @@ FAR = 2.0**-20
 CLEAR = 64 * EPSILON
 """Changes above it, relative to the terms of an iterate, are more than their roundoff."""
 
+SURE = 2.0**-10
+"""What is likely roundoff of a size, which is a bound that can be far too large: changes clear of it are looked at again."""
+
 PATIENCE = 3.0
 """Times that an iteration may pause above it: its error can go to and fro between the entries."""
 
@@ -69,9 +72,9 @@ class Iteration:
         now, unstable = b.load(one.bool, active), over.flag()
         rooms = self.pair.now(), self.pair.others()
         if sweep.together:
-            peak = over.peak()
-            sweep.sweep(lambda node, new, stable: self._measured(sweep, node, new, peak, *rooms))
-            further = self._shrinks(over.highest(peak))
+            peaks = over.peak(), over.peak()
+            sweep.sweep(lambda node, new, stable: self._measured(sweep, node, new, peaks, *rooms))
+            further = self._shrinks(*map(over.highest, peaks))
         else:
             going = over.flag()
             sweep.sweep(lambda node, new, stable: self._compared(sweep, node, new, stable, now, going, unstable, *rooms))
@@ -81,11 +84,12 @@ class Iteration:
         b.store("i64", count, count_here)
         allowed = b.put(f"icmp slt i64 {count}, %cap")
         still = b.put(f"select i1 {b.put(f'icmp eq i64 {count}, 1')}, {one.bool} {one.true}, {one.bool} {further}")
-        still = one.both(now, still)
-        still = b.put(f"select i1 {allowed}, {one.bool} {still}, {one.bool} {one.false}")
+        shrinking = one.both(now, still)
+        still = b.put(f"select i1 {allowed}, {one.bool} {shrinking}, {one.bool} {one.false}")
         b.store(one.bool, still, active)
         before = one.both(b.load(one.bool, shaky), one.invert(now))
-        b.store(one.bool, one.either(before, one.both(now, over.marked(unstable))), shaky)
+        cut = b.put(f"select i1 {allowed}, {one.bool} {one.false}, {one.bool} {shrinking}")
+        b.store(one.bool, one.either(one.either(before, cut), one.both(now, over.marked(unstable))), shaky)
         self.pair.swap()
         b.branch_if(one.any(still), head, out)
         b.label(out)
@@ -100,16 +104,19 @@ class Iteration:
             b.label(ended)
         self._judge(sweep, one.either(missed, b.load(one.bool, shaky)))
 
-    def _measured(self, sweep: Sweep, node: str, new: list[str], peak: str, rooms: list, others: list) -> None:
-        """The new iterates at a node into the other rooms; and their largest change, by the sizes of the iterates."""
+    def _measured(self, sweep: Sweep, node: str, new: list[str], peaks: tuple[str, str], rooms: list, others: list) -> None:
+        """The new iterates at a node into the other rooms; and their largest change, by the sizes of the iterates, and by what is
+        likely of these."""
         over, e = self.all, self.all.emitter
         for a, room, other, place, size in zip(new, rooms, others, self.moved, sweep.sizes(self.sizes), strict=True):
-            moved, scale = e.abs(e.sub(a, over.load(room, node))), e.add(e.abs(a), over.splat(size))
-            over.raised(peak, e.select(e.compare("ogt", moved, e.const(0.0)), e.div(moved, scale), e.const(0.0)))
+            moved, size = e.abs(e.sub(a, over.load(room, node))), over.splat(size)
+            for peak, part in zip(peaks, (size, e.mul(size, e.const(SURE))), strict=True):
+                relative = e.div(moved, e.add(e.abs(a), part))
+                over.raised(peak, e.select(e.compare("ogt", moved, e.const(0.0)), relative, e.const(0.0)))
             over.store(moved, place, node)
             over.store(a, other, node)
 
-    def _shrinks(self, update: str) -> str:
+    def _shrinks(self, of_size: str, update: str) -> str:
         """Whether the largest change is not small yet, or more than roundoff and the smallest so far is one of the last: an error
         that goes to and fro between coordinates does not shrink at every sweep."""
         b, one = self.body, self.one
@@ -122,7 +129,7 @@ class Iteration:
         now = one.max(update, last)
         left = one.both(one.compare("ogt", now, one.const(EPSILON)), one.compare("olt", stale, patience))
         begun = one.compare("oeq", last, one.const(float("inf")))
-        return one.either(one.either(begun, one.compare("ogt", update, one.const(STALLED))), left)
+        return one.either(one.either(begun, one.compare("ogt", of_size, one.const(STALLED))), left)
 
     def _compared(
         self, sweep: Sweep, node: str, new: list[str], stable: str, now: str, going: str, unstable: str, rooms: list, others: list
@@ -194,11 +201,12 @@ class Iteration:
         """Mark where a last change is not small, or was not to be the last and is more than roundoff."""
         over, e = self.all, self.all.emitter
         sizes, iterates = sweep.sizes(self.sizes), self.pair.now()
-        limits = [(self.moved, CLEAR)] if sweep.together else [(self.moved, STALLED), (self.open, CLEAR)]
+        limits = [(self.moved, CLEAR, 1.0)] if sweep.together else [(self.moved, STALLED, 1.0), (self.open, CLEAR, SURE)]
         with over.at() as node:
             off = e.false
             for i, size in enumerate(sizes):
-                whole = e.add(e.abs(over.load(iterates[i], node)), over.splat(size))
-                for changes, most in limits:
+                own = e.abs(over.load(iterates[i], node))
+                for changes, most, share in limits:
+                    whole = e.add(own, e.mul(over.splat(size), e.const(share)))
                     off = e.either(off, e.compare("ugt", over.load(changes[i], node), e.mul(whole, e.const(most))))
             over.mark(missed, off)
