@@ -108,5 +108,6 @@ def test_complex_numbers_on_the_way(potential, real):
 
     with jax.numpy_dtype_promotion("standard"):
         sol = run(potential)
+        assert sol.stats["engine"] == "native"
         np.testing.assert_allclose(sol.q, run(real).q, rtol=0, atol=1e-13)
         assert dx.verify(sol).ok

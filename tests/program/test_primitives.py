@@ -38,6 +38,9 @@ V, M, S = (3,), (3, 3), ()
 CONSTANT = np.arange(12.0).reshape(3, 4) - 5
 spd = lambda a: a @ a.T + 3 * jnp.eye(3)
 
+z_of, ROOT = jax.lax.complex, jnp.array(0.3 - 0.8j)
+parts = lambda z: jnp.stack([z.real, z.imag])
+
 
 @jax.custom_jvp
 def halved(x):
@@ -132,6 +135,75 @@ CASES = {
     "triangular": (lambda a, x: jax.scipy.linalg.solve_triangular(a, x, lower=True, trans=1), M, V),
     "gradient of a solve": (lambda a, x: jax.grad(lambda x: jnp.sum(jnp.linalg.solve(a, jnp.sin(x)) ** 2))(x), M, V),
     "hessian": (lambda x: jax.hessian(lambda x: jnp.sqrt(x @ x) * jnp.cos(x[0] * x[1]))(x), V),
+    "complex arithmetic": (
+        lambda x, y: parts(z_of(x, y) * z_of(y, x) / (z_of(x, x * y) - ROOT) + (-z_of(x, y)) ** 3 + z_of(y, x) ** -2),
+        V,
+        V,
+    ),
+    "complex functions": (
+        lambda x, y: parts(
+            jnp.exp(z_of(x, y))
+            + jnp.sin(z_of(x, y)) * jnp.cos(z_of(y, x))
+            + jnp.tan(z_of(x, y))
+            + jnp.expm1(z_of(x, y) / ROOT)
+            + jnp.sinh(z_of(x, y))
+            - jnp.cosh(z_of(y, x)) * jnp.tanh(z_of(y, x))
+        ),
+        V,
+        V,
+    ),
+    "complex roots": (
+        lambda x, y: (
+            parts(jnp.sqrt(z_of(x, y)) + jnp.log(z_of(x, y)) + jnp.log1p(z_of(x, y) / 100) + z_of(x, y) ** z_of(y, x))
+            + jnp.abs(z_of(x, y))[None]
+            + jnp.angle(z_of(x, y))[None]
+            + (z_of(x, y) == ROOT).astype(float)[None]
+        ),
+        V,
+        V,
+    ),
+    "complex signs": (lambda x, y: parts(jnp.sign(z_of(x, y)) + jnp.sign(z_of(0 * x, 0 * x))), V, V),
+    "complex zero": (
+        lambda x, y: (
+            jnp.abs(z_of(0 * x, 0 * y)) ** 2 + (jnp.sqrt(z_of(0 * x, 0 * y)) + z_of(0 * x, 0 * y) ** jnp.real(ROOT)).real
+        ),
+        V,
+        V,
+    ),
+    "complex arrays": (
+        lambda a, x: parts(
+            z_of(a, a.T) @ z_of(x, x)[::-1]
+            + jnp.vdot(z_of(x, x), z_of(a[0], x))
+            + jnp.conj(z_of(x, x)).sum()
+            + jnp.concatenate([z_of(x, a[1])[1:], z_of(x, x)[:1].at[0].add(ROOT)])[jnp.array([2, 0, 1])]
+            + jnp.where(x > 0, z_of(x, x), ROOT)
+            + jnp.cumsum(z_of(x, a[0]))
+            + jnp.roll(jnp.zeros(3, complex).at[1].set(z_of(x, x)[2]), 1)
+        ),
+        M,
+        V,
+    ),
+    "complex loops": (
+        lambda x, y: parts(
+            jax.lax.fori_loop(0, 3, lambda i, z: jax.jit(jnp.sin)(z) + ROOT, z_of(x, y))
+            + jax.lax.scan(lambda z, w: (z * w, z - w), z_of(x, y)[0], z_of(y, x))[1]
+            + jax.lax.while_loop(lambda c: c[0] < 3, lambda c: (c[0] + 1, c[1] * ROOT), (0, z_of(x, y)))[1]
+            + jax.lax.cond(x[0] > 0, jnp.exp, lambda z: z * z, z_of(x, y))
+        ),
+        V,
+        V,
+    ),
+    "transforms": (
+        lambda a: jnp.concatenate(
+            [
+                jnp.ravel(parts(jnp.fft.fft(a)) + parts(jnp.fft.ifft2(z_of(a, a.T)))),
+                jnp.ravel(jnp.fft.irfft(jnp.fft.rfft(a) * jnp.arange(2).astype(complex)[None], 3)),
+                jnp.ravel(jnp.fft.irfft2(jnp.fft.rfft2(a[:2, :2] * a[1:, 1:]))),
+                jnp.ravel(parts(jnp.fft.rfftn(jnp.tile(a, (2, 2))))),
+            ]
+        ),
+        M,
+    ),
     "dead code that is not supported": (lambda x: (jnp.linalg.eigvalsh(jnp.outer(x, x)), 2 * x)[1], V),
 }
 
@@ -156,7 +228,7 @@ UNSUPPORTED = {
     "while": lambda x: jax.lax.while_loop(lambda c: c[0] < 9, lambda c: c * 2, x),
     "while of each": lambda x: jax.vmap(lambda y: jax.lax.while_loop(lambda c: c < 9, lambda c: c * 2, y))(x),
     "convert_element_type": lambda x: x.astype(jnp.float32).astype(float),
-    "complex": lambda x: jnp.abs(jax.lax.complex(x, x)),
+    "acos": lambda x: jnp.arccos(jax.lax.complex(x, x)).real,
     "sort": lambda x: jnp.sort(x),
     "mul": lambda x: (jnp.floor(x).astype(int) * 1103515245 % 1000).astype(float),
     "lu": lambda x: jnp.linalg.det(jnp.outer(jnp.tile(x, 5), jnp.tile(x, 5))),
@@ -186,7 +258,9 @@ def test_expressions_are_built_once_and_simplified():
 
 
 DIFFERENTIABLE = ("arithmetic", "powers", "elementary", "inverse", "error function", "extremes", "where", "products", "hessian",
-                  "solve", "fori_loop", "remainders", "determinant", "softplus and friends")  # fmt: skip
+                  "solve", "fori_loop", "remainders", "determinant", "softplus and friends", "complex arithmetic",
+                  "complex functions",
+                  "complex roots", "complex arrays", "complex loops", "transforms")  # fmt: skip
 
 
 @pytest.mark.parametrize("name", DIFFERENTIABLE)

@@ -9,7 +9,9 @@ from jax._src import source_info_util
 from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Literal
 
+from dirax.program.complex_numbers import in_pairs, is_complex
 from dirax.program.graph import Graph
+from dirax.program.pairs import Pair
 from dirax.program.whole_numbers import Ranges, are_floats
 
 Nodes = np.ndarray
@@ -55,15 +57,20 @@ RULES: dict[str, Rule] = {}
 LAZY: set[str] = set()
 """Primitives whose rule looks at its operands itself: an unavailable one matters only where it is used."""
 
+IN_PAIRS: set[str] = set()
+"""Those whose rule takes pairs for complex numbers."""
 
-def rule(*names: str, lazy: bool = False) -> Callable[[Rule], Rule]:
-    """Register a rule for primitives of these names."""
+
+def rule(*names: str, lazy: bool = False, pairs: bool = False) -> Callable[[Rule], Rule]:
+    """Register a rule for primitives of these names, `lazy` and in `pairs` as those two say."""
 
     def register(function: Rule) -> Rule:
         for name in names:
             RULES[name] = function
             if lazy:
                 LAZY.add(name)
+            if pairs:
+                IN_PAIRS.add(name)
         return function
 
     return register
@@ -93,12 +100,14 @@ class Interpreter:
             values.update(zip(equation.outvars, results, strict=True))
         return [read(atom) for atom in jaxpr.outvars]
 
-    def constants(self, value: Any) -> Nodes | Unavailable:
-        """The nodes of a concrete array."""
+    def constants(self, value: Any) -> Any:
+        """The nodes of a concrete array, a pair of a complex one, or Unavailable."""
         if isinstance(value, Tracer):
             return Unavailable(UnsupportedPrimitive("constant", "is a value that JAX traces", "a captured array"))
         known = isinstance(value, jax.Array | np.ndarray | np.generic)
         dtype = value.dtype if known else np.asarray(value).dtype
+        if dtype == np.complex128:
+            return Pair(*map(self.constants, (np.real(value), np.imag(value))))
         if not is_held_by_nodes(dtype) and dtype not in SHORT:
             failure = UnsupportedPrimitive("constant", f"has dtype {dtype}", "a captured array")
             return Held(value, failure) if known else Unavailable(failure)
@@ -152,14 +161,19 @@ class Interpreter:
             if isinstance(nodes, Held):
                 values.append(nodes.value)
                 continue
-            numbers = [self.graph.value[n] for n in nodes.ravel().tolist() if self.graph.is_constant(n)]
-            if len(numbers) < nodes.size:
+            re, im = map(self._constant, nodes if isinstance(nodes, Pair) else (nodes, np.zeros(0, np.int64)))
+            if re is None or im is None:
                 return None
-            values.append(np.array(numbers, dtype=float).reshape(nodes.shape).astype(atom.aval.dtype))
+            values.append((re + 1j * im if isinstance(nodes, Pair) else re).astype(atom.aval.dtype))
         with jax.ensure_compile_time_eval():
             found = equation.primitive.bind(*values, **equation.params)
         results = found if equation.primitive.multiple_results else [found]
         return [self._of_known(value, equation) for value in results]
+
+    def _constant(self, nodes: Nodes) -> np.ndarray | None:
+        """The numbers of constant nodes, None when one is not constant."""
+        numbers = [self.graph.value[n] for n in nodes.ravel().tolist() if self.graph.is_constant(n)]
+        return None if len(numbers) < nodes.size else np.array(numbers, dtype=float).reshape(nodes.shape)
 
     def _of_known(self, value: Any, equation: Any) -> Nodes | Unavailable:
         """The nodes of a concrete array, which is held where they do not hold it."""
@@ -180,6 +194,8 @@ class Interpreter:
         try:
             if lost is not None and name not in LAZY:
                 return self._known(equation, operands) or [Unavailable(lost.error)] * len(equation.outvars)
+            if any(map(is_complex, (*equation.invars, *equation.outvars))) and name not in IN_PAIRS:
+                return self._in_pairs(equation, operands)
             if name not in self.rules:
                 raise Unsupported("is not supported")
             if name not in LAZY:  # those look at what is inside
@@ -192,6 +208,17 @@ class Interpreter:
             return [Unavailable(self._failure(name, str(error)))] * len(equation.outvars)
         finally:
             self._equations.pop()
+
+    def _in_pairs(self, equation: Any, operands: list[Any]) -> list[Any]:
+        """The results of an equation with complex numbers, by the real parts that it is made of. Raises `Unsupported`."""
+        if (closed := in_pairs(equation)) is None:
+            raise Unsupported("is not known of complex numbers")
+        given = []
+        for operand, variable in zip(operands, equation.invars, strict=True):
+            parts = operand if isinstance(operand, Pair) else [operand] * (1 + is_complex(variable))  # one that is lost twice
+            given.extend(parts)
+        found = iter(self.run(closed, *given))
+        return [Pair(next(found), next(found)) if is_complex(v) else next(found) for v in equation.outvars]
 
 
 def folds(equation: Any) -> bool:

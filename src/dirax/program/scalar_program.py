@@ -20,6 +20,7 @@ from dirax.program.evaluation.tape import FEWEST_NODES, Tape
 from dirax.program.graph import NODE_LIMIT, Graph, GraphTooLarge, Order, with_ends
 from dirax.program.interpreter import Interpreter, Nodes, Unavailable, UnsupportedPrimitive, elementwise, is_integer
 from dirax.program.memo import Memo, Same
+from dirax.program.pairs import Pair
 from dirax.program.primitives import plain_primitive
 
 OFTEN = 32
@@ -86,6 +87,8 @@ class ScalarProgram:
         for result in self.results:
             if isinstance(result, Unavailable):
                 raise result.error
+            if isinstance(result, Pair):
+                raise UnsupportedPrimitive("result", "is complex", "its caller")
 
     def fresh(self, shape: tuple[int, ...]) -> Nodes:
         """New input nodes."""

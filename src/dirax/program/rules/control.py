@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 
@@ -21,20 +22,23 @@ def closed(jaxpr: Any) -> ClosedJaxpr:
     return jaxpr if hasattr(jaxpr, "consts") else ClosedJaxpr(jaxpr, ())
 
 
-@rule("jit", "pjit", "closed_call", "core_call", "remat", "checkpoint", "remat2", "composite", "dirax_program", lazy=True)
+CALLS = "jit", "pjit", "closed_call", "core_call", "remat", "checkpoint", "remat2", "composite", "dirax_program"
+
+
+@rule(*CALLS, lazy=True, pairs=True)
 def call(interpreter: Interpreter, equation: Any, *operands):
     """The jaxpr of a function that is called again is the same object; with the same operands it has the same results."""
     p = equation.params
     jaxpr = p["jaxpr"] if "jaxpr" in p else p["call_jaxpr"]
-    if any(isinstance(o, Unavailable) for o in operands):
+    if any(isinstance(o, Unavailable) for o in jax.tree.leaves(operands)):
         return interpreter.run(closed(jaxpr), *operands)
-    key = id(jaxpr), *(part for o in operands for part in (o.shape, o.tobytes()))
+    key = id(jaxpr), *(part for o in jax.tree.leaves(operands) for part in (o.shape, o.tobytes()))
     if key not in interpreter.called:
         interpreter.called[key] = jaxpr, interpreter.run(closed(jaxpr), *operands)
     return interpreter.called[key][1]
 
 
-@rule("custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr", lazy=True)
+@rule("custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr", lazy=True, pairs=True)
 def custom_derivative(interpreter: Interpreter, equation: Any, *operands):
     return interpreter.run(closed(inner_jaxpr(equation)), *operands)
 

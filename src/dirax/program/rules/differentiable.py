@@ -12,6 +12,7 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun, jaxprs_in_params
 
+from dirax.program.complex_numbers import is_complex
 from dirax.program.interpreter import Interpreter, Nodes, Rule, Unavailable, Unsupported, elementwise
 from dirax.program.memo import Memo, Same
 from dirax.program.rules import derivative_primitives, formulas
@@ -30,6 +31,8 @@ def stopped(interpreter: Interpreter, equation: Any, *operands: Nodes) -> list[N
 def by_its_rule(interpreter: Interpreter, equation: Any, *operands: Any) -> list[Any]:
     if lost := next((x for x in operands if isinstance(x, Unavailable)), None):
         return [Unavailable(lost.error)] * len(equation.outvars)
+    if any(map(is_complex, (*equation.invars, *equation.outvars))):
+        raise Unsupported("has a rule of its own for its derivative by complex numbers")
     make, plain = interpreter.graph.make, Interpreter(interpreter.graph)
     values = plain.run(closed(inner_jaxpr(equation)), *operands)
     of = lambda op, arrays: [elementwise(functools.partial(make, op), x) for x in arrays]

@@ -22,7 +22,7 @@ BY_ENTRY = frozenset(
         *("sqrt", "rsqrt", "cbrt", "exp", "exp2", "expm1", "log", "log1p", "logistic", "sin", "cos", "tan", "asin", "acos"),
         *("atan", "atan2", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh", "erf", "erfc", "erf_inv", "lgamma", "digamma"),
         *("floor", "ceil", "round", "nextafter", "clamp", "convert_element_type", "copy", "copy_p", "reduce_precision"),
-        *("real", "imag", "bessel_i0e", "bessel_i1e", "igamma", "igammac", "polygamma"),
+        *("real", "imag", "complex", "conj", "bessel_i0e", "bessel_i1e", "igamma", "igammac", "polygamma"),
     )
 )
 """Primitives that compute entry by entry."""
