@@ -61,7 +61,9 @@ def test_second_derivatives_and_axes_of_vmap():
 
 
 def test_what_is_no_scalar_program_is_left_to_others():
-    assert jax.jit(lambda x: jnp.zeros(on_host(lambda x: jnp.arccos(jax.lax.complex(x, x)).real, [x], "acos") is None))(X).shape == (1,)
+    assert jax.jit(lambda x: jnp.zeros(on_host(lambda x: jnp.arccos(jax.lax.complex(x, x)).real, [x], "acos") is None))(
+        X
+    ).shape == (1,)
     assert jax.jit(lambda x: jnp.zeros(on_host(lambda x: x * x, [jnp.tile(x, 100)], "many") is None))(X).shape == (1,)
     closing = lambda x: jnp.zeros(on_host(lambda y: y * x[0], [x], "closed over") is None)
     assert jax.jit(closing)(X).shape == (1,)
