@@ -279,3 +279,85 @@ def test_what_grows_like_t_is_not_called_stable():
 def test_a_place_that_is_none_is_said(at, text):
     with pytest.raises(ValueError, match=text):
         dx.linearize(dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q), at)
+
+
+def rolling():
+    return dx.LagrangeDirac(
+        lambda q, v: (v[0] ** 2 + v[1] ** 2) / 2 + v[2] ** 2 / 8 + v[3] ** 2 / 4,
+        lambda q: jnp.stack([jnp.stack([1.0, 0.0, -jnp.cos(q[3]), 0.0]), jnp.stack([0.0, 1.0, -jnp.sin(q[3]), 0.0])]),
+    )
+
+
+OF_THE_DISK = [*(lambda q, k=k: jnp.zeros(4).at[k].set(1.0) for k in range(3)), lambda q: jnp.stack([-q[1], q[0], 0.0, 1.0])]
+
+
+def test_a_disk_that_rolls_straight_on_drifts_whatever_its_heading():
+    """All eigenvalues are zero, and the roundoff of the largest was taken for a rate: the verdicts changed with the heading. The
+    position goes like t² times a rate of turning; nothing of that is left on the quotient."""
+    disk, at = rolling(), lambda a, u: {"q": [0.0, 0.0, 0.0, a], "v": [u * np.cos(a), u * np.sin(a), u, 0.0]}
+    for angle, speed in zip(np.linspace(0.1, 6.1, 12), np.geomspace(0.01, 100.0, 12), strict=True):
+        found = dx.linearize(disk, at(angle, speed))
+        assert found.stable and found.defective and found.matrix.shape == (6, 6)
+        power = np.linalg.matrix_power(found.matrix / np.abs(found.matrix).max(), 3)
+        np.testing.assert_allclose(power, 0.0, atol=1e-14)
+        assert np.linalg.matrix_rank(found.matrix, tol=1e-9 * np.abs(found.matrix).max()) == 3
+    quotient = dx.linearize(disk, at(0.5, 1.0), symmetries=OF_THE_DISK)
+    assert quotient.stable and not quotient.defective and quotient.matrix.shape == (2, 2)
+
+
+def test_a_disk_that_turns_on_the_spot_moves_along_a_symmetry():
+    """Its constraints turn with it, which was found out afterwards only, as an error of the library."""
+    at = {"q": [0.0, 0.0, 0.0, 2.0], "v": [0.0, 0.0, 0.0, 2.0]}
+    with pytest.raises(ValueError, match=r"no relative equilibrium: .* or the symmetries="):
+        dx.linearize(rolling(), at)
+    found = dx.linearize(rolling(), at, symmetries=OF_THE_DISK[3:])
+    assert found.stable and found.defective
+    np.testing.assert_allclose(np.sort(found.eigenvalues.imag), [-2.0, 0.0, 0.0, 0.0, 2.0], atol=1e-7)
+
+
+def test_a_ridge_whose_curvature_changes_on_the_way_is_no_equilibrium():
+    """The acceleration is zero all along it."""
+    ridge = dx.LagrangeDirac(lambda q, v: v @ v / 2 - (1 + 0.5 * jnp.sin(q[0])) * q[1] ** 2 / 2)
+    with pytest.raises(ValueError, match="no relative equilibrium"):
+        dx.linearize(ridge, {"q": [0.0, 0.0], "v": [1.0, 0.0]})
+    assert dx.linearize(ridge, {"q": [0.0, 0.0], "v": [0.0, 0.0]}).stable
+
+
+@pytest.mark.parametrize("turn", [[1.0, 0.0, 0.0, 0.0], [0.5, 0.5, -0.5, 0.5], [0.1, -0.7, 0.5, -0.5]])
+def test_one_free_direction_among_several_zeros_is_found_however_a_body_is_turned(turn):
+    """A body in a fluid that moves along its axis of largest added mass, and may begin to turn about it: of five zero eigenvalues
+    one has no eigenvector of its own."""
+    added, inertia = jnp.array([2.0, 3.0, 4.0]), jnp.array([1.0, 1.5, 0.8])
+
+    def lagrangian(q, v):
+        w, r, velocity = q[0], q[1:4], v[4:]
+        rate = 2 * (w * v[1:4] - v[0] * r - jnp.cross(r, v[1:4]))
+        own = velocity * (w * w - r @ r) + 2 * r * (r @ velocity) - 2 * w * jnp.cross(r, velocity)
+        return own @ (added * own) / 2 + rate @ (inertia * rate) / 2 + (q[:4] @ v[:4]) ** 2 / 2
+
+    body = dx.LagrangeDirac(lagrangian, holonomic=lambda q: jnp.stack([q[:4] @ q[:4] - 1]))
+    q = np.array([*turn, 0.3, -0.4, 0.7])
+    v = np.concatenate([np.zeros(4), 1.3 * np.array(dx.SO3().matrix(q[:4]))[:, 2]])
+    shifts = [lambda q, k=k: jnp.zeros(7).at[k].set(1.0) for k in (4, 5, 6)]
+    found = dx.linearize(body, {"q": q, "v": v}, symmetries=shifts)
+    assert found.stable and found.defective
+
+
+@pytest.mark.parametrize(
+    "system",
+    [
+        dx.ManifoldLagrangian(lambda q, v: v @ v / 2 - q[2], dx.Sphere(3)),
+        dx.EulerPoincare(dx.SO3(), lambda xi: xi @ (jnp.array([1.0, 2.0, 3.0]) * xi) / 2),
+    ],
+)
+def test_systems_that_are_linearized_as_others_say_as_which(system):
+    with pytest.raises(TypeError, match=r"is not linearized: .*lie_poisson\(\)"):
+        dx.linearize(system, {"x": np.zeros(3)})
+
+
+def test_a_lie_poisson_system_is_linearized():
+    """About the middle axis of inertia, ω = (0, 1, 0)."""
+    top = dx.EulerPoincare(dx.SO3(), lambda xi: xi @ (jnp.array([1.0, 2.0, 3.0]) * xi) / 2).lie_poisson()
+    found = dx.linearize(top, {"x": [0.0, 2.0, 0.0]})
+    np.testing.assert_allclose(found.eigenvalues[0], np.sqrt((2 - 1) * (3 - 2) / (1 * 3)), rtol=1e-12)
+    assert not found.stable

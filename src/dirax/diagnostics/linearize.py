@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import scipy.linalg
+import scipy.sparse.csgraph
 
 from dirax.diagnostics.linearized_field import FieldAt, linearized_chain, linearized_lagrangian
 from dirax.diagnostics.linearized_step import linearized_step
@@ -31,9 +32,6 @@ OF_STEPS = (
 
 ROUNDOFF = 2e-14
 """Error of an entry of the linear equations, relative to the largest one, where nothing is known of more."""
-
-PARALLEL = 1e-9
-"""How near to 1 the cosine between two eigenvectors must be to be called one."""
 
 MULTIPLE = 1e-6
 """Error of eigenvalues of which several are one, relative to the largest one, at most."""
@@ -91,13 +89,12 @@ class Linearization:
 
     @property
     def defective(self) -> bool:
-        """Whether eigenvalues that are one, to 1e-6 of the largest, have one eigenvector alone: then some small motions grow like
-        t times what the eigenvalue says, as those of a free particle do at rest, q = v t."""
-        if not len(self.matrix):
-            return False
-        values, own = np.linalg.eig(scipy.linalg.matrix_balance(self.matrix)[0])  # in units in which rows are as large as columns
-        near = np.abs(values[:, None] - values[None]) <= MULTIPLE * np.abs(values).max(initial=0.0)
-        return bool(np.any(np.triu(near & (np.abs(own.conj().T @ own) > 1.0 - PARALLEL), 1)))
+        """Whether eigenvalues that are one, to their error, have fewer eigenvectors than they are: then some small motions grow
+        like t times what the eigenvalue says, as those of a free particle do at rest, q = v t."""
+        error = self.error * np.abs(self.matrix).max(initial=0.0)
+        values, errors = _with_errors(self.matrix, error)
+        several = (np.mean(values[together]) for together in _clusters(values, errors) if len(together) > 1)
+        return any(_is_defective(self.matrix, value, error) for value in several)
 
     @property
     def modes(self) -> np.ndarray:
@@ -109,21 +106,47 @@ class Linearization:
     @property
     def stable(self) -> bool:
         """Whether no small motion grows by more than its own eigenvalue may be off: the `error` of the matrix times the condition
-        number of the eigenvalue, but at most 1e-6 of the largest one, as where several are one."""
+        number of the eigenvalue, but at most 1e-6 of the largest one. Eigenvalues that are one grow as their mean."""
         if not len(self.matrix):
             return True
-        values, vectors = np.linalg.eig(self.matrix)
-        rates, error = np.real(values), self.error * np.abs(self.matrix).max()
+        error = self.error * np.abs(self.matrix).max()
+        values, errors = _with_errors(self.matrix, error)
+        for together in _clusters(values, errors):
+            values[together] = np.mean(values[together])
         most = MULTIPLE * (np.abs(self.matrix) if self.step is None else np.abs(self.eigenvalues)).max()
-        with np.errstate(all="ignore"):
-            try:
-                left = np.linalg.inv(vectors)
-            except np.linalg.LinAlgError:  # several eigenvalues are one, with one eigenvector
-                left = np.full_like(vectors, np.inf)
-            errors = error * np.linalg.norm(left, axis=1) * np.linalg.norm(vectors, axis=0)
-            if self.step is not None:
+        rates = np.real(values)
+        if self.step is not None:
+            with np.errstate(divide="ignore"):
                 rates, errors = np.log(np.abs(values)) / self.step, errors / (np.abs(values) * self.step)
-        return bool(np.all(rates <= np.fmin(errors, most)))
+                error = error / self.step
+        return bool(np.all(rates <= np.fmin(errors, max(most, error))))
+
+
+def _is_defective(matrix: np.ndarray, value: complex, error: float) -> bool:
+    """Whether (A − λ)² has more zeros than A − λ, whose entries may be off by `error`."""
+    once = matrix - value * np.eye(len(matrix))
+    sizes, squares = (np.linalg.svd(power, compute_uv=False) for power in (once, once @ once))
+    cut = max(RANK, len(matrix) * error / max(sizes[0], TINY))
+    return bool(np.sum(squares <= cut * sizes[0] ** 2) > np.sum(sizes <= cut * sizes[0]))
+
+
+def _with_errors(matrix: np.ndarray, error: float) -> tuple[np.ndarray, np.ndarray]:
+    """The eigenvalues of a matrix, and by how much each may be off where its entries are by `error`: at most by what four that
+    are one with one eigenvector are."""
+    if not len(matrix):
+        return np.zeros(0, complex), np.zeros(0)
+    values, left, right = scipy.linalg.eig(matrix, left=True)
+    size = np.abs(matrix).max()
+    with np.errstate(divide="ignore"):
+        errors = error / np.abs(np.sum(left.conj() * right, axis=0))
+    return values, np.minimum(errors, size * (error / size) ** 0.25 if size > 0.0 else 0.0)
+
+
+def _clusters(values: np.ndarray, errors: np.ndarray) -> list[np.ndarray]:
+    """The numbers of eigenvalues that may be one."""
+    near = np.abs(values[:, None] - values) <= np.minimum(errors[:, None], errors)
+    labels = scipy.sparse.csgraph.connected_components(near, directed=False)[1]
+    return [np.flatnonzero(labels == label) for label in np.unique(labels)]
 
 
 def _complex(value: complex) -> str:
@@ -163,13 +186,16 @@ def linearize(
         dx.linearize(bicycle.MODEL.system, bicycle.straight(5.0), symmetries=bicycle.SYMMETRIES).eigenvalues
 
     Raises `ValueError` for a place of other names, at one that is no relative equilibrium, and for generators that are no
-    symmetries; `TypeError` for systems without a Lagrangian where symmetries or a scheme are given.
+    symmetries; `TypeError` for systems on manifolds and on Lie algebras, and for those without a Lagrangian where symmetries or a
+    scheme are given.
     """
     generators = list(symmetries.values()) if isinstance(symmetries, Mapping) else list(symmetries)
     if (scheme is None) != (step is None):
         raise ValueError("a scheme is linearized with its step: give scheme= and step= together, or neither.")
     refuse_traced("dx.linearize", at, params, step)
     refuse_changed(functions_in([system, scheme]))
+    if system.linearized_as:
+        raise TypeError(f"a {type(system).__name__} is not linearized: {system.linearized_as}.")
     wanted = ("x",) if system.lagrangian_form() is None else ("q", "v")
     if not isinstance(at, Mapping) or not set(wanted) <= set(at):
         given = f"{', '.join(map(str, at)) or 'nothing'} was given" if isinstance(at, Mapping) else f"{at!r:.80} was given"
@@ -221,7 +247,8 @@ def _reduced(found: FieldAt, step: float | None) -> Linearization:
     across = tangent - _project(found.symmetric, tangent)
     basis = _orthonormal(across)
     matrix = found.rate * (basis.T @ found.matrix @ basis)
-    error = ROUNDOFF + float(found.residual) + found.error
+    largest = np.abs(matrix).max(initial=0.0)  # which may be roundoff of what was there before
+    error = (ROUNDOFF + float(found.residual) + found.error) * max(1.0, found.rate * size / largest if largest > 0.0 else 1.0)
     return Linearization(matrix, found.units[:, None] * basis, float(found.residual), step, error)
 
 

@@ -18,6 +18,12 @@ from dirax.systems.lagrange_dirac import LagrangeDirac
 RANK = 1e-10
 """Singular values of the constraints, relative to the largest one, that count as zero."""
 
+SLOWEST = 1e-2
+"""Eigenvalues of several rows that are zero may come out as such a part of the largest entries."""
+
+WHILE = 0.75
+"""How long a constant velocity is followed, in units of the time of small motions."""
+
 
 class FieldAt(NamedTuple):
     """The matrix (N, N) of the linear equations in the frame that moves with the motion, and the columns that span the tangent
@@ -126,11 +132,7 @@ def linearized_lagrangian(system: LagrangeDirac, at: Mapping[str, Any], generato
     """Of a Lagrangian with constraints, in z = (q, v)."""
     q, v = (np.asarray(at[name], float) for name in ("q", "v"))
     n, z, equations = q.size, np.concatenate([q, v]), equations_of(system, float(at.get("t", 0.0)))
-    w = _solved(equations, z, params)
-    by_z, by_w = (np.asarray(x) for x in evaluated(equations.linear, z, w, params))
-    derivative = np.zeros((2 * n, 2 * n))
-    derivative[:n, n:] = np.eye(n)
-    derivative[n:] = -_least_squares(by_w, by_z, n)[:n]
+    w, derivative = _linear(equations, z, params)
     lifted, slopes = [], []
     for generator in generators:
         value, slope, bend = (np.asarray(x) for x in evaluated(_lifts.get(generator, lambda g=generator: Lift(g)).at, q, v))
@@ -139,6 +141,7 @@ def linearized_lagrangian(system: LagrangeDirac, at: Mapping[str, Any], generato
     symmetric = np.stack(lifted, axis=1) if lifted else np.zeros((2 * n, 0))
     energy, forces, metric = (np.asarray(a) for a in evaluated(equations.sizes, q, v, w[n:], params))
     units, rate = _units(energy, forces, metric, v, derivative)
+    tangent = _tangent(equations, z, params, units)
     field, symmetric = np.concatenate([v, w[:n]]) / units / rate, symmetric / units[:, None]
     if lifted:
         sizes = power_of_two(np.abs(symmetric).max(axis=0))
@@ -150,24 +153,58 @@ def linearized_lagrangian(system: LagrangeDirac, at: Mapping[str, Any], generato
             derivative[n:, n:] -= share * slope
             derivative[n:, :n] -= share * bend
     else:
-        drift, changed = field[n:], derivative[n:, :n] @ v / units[n:] / rate**2
-        residual = np.abs([*drift, *changed]).max() / (1.0 + np.abs(field).max())
-    tangent = np.eye(2 * n)
-    if system.constraints.any:
-        tangent = kernel(np.asarray(evaluated(equations.tangent, z, params)) * units)
+        changed = _changed(equations, z, params, (derivative, tangent, units, rate)) if np.any(v) else 0.0
+        residual = max(np.abs(field[n:]).max() / (1.0 + np.abs(field).max()), changed)
     return FieldAt(scaled_matrix(derivative, units) / rate, tangent, symmetric, residual, units, rate)
+
+
+def _linear(equations: Equations, z: np.ndarray, params: Any) -> tuple[np.ndarray, np.ndarray]:
+    """w = (a, u) at z = (q, v), and the derivative of (v, a) by z."""
+    n, w = z.size // 2, _solved(equations, z, params)
+    by_z, by_w = (np.asarray(x) for x in evaluated(equations.linear, z, w, params))
+    derivative = np.zeros((2 * n, 2 * n))
+    derivative[:n, n:] = np.eye(n)
+    derivative[n:] = -_least_squares(by_w, by_z, n)[:n]
+    return w, derivative
+
+
+def _tangent(equations: Equations, z: np.ndarray, params: Any, units: np.ndarray) -> np.ndarray:
+    """The tangent space of the constraints at z, in these units."""
+    if not equations.system.constraints.any:
+        return np.eye(z.size)
+    return kernel(np.asarray(evaluated(equations.tangent, z, params)) * units)
+
+
+def _changed(equations: Equations, z: np.ndarray, params: Any, here: tuple) -> float:
+    """How much a motion with a constant velocity has changed the linear equations, relative to their terms, and the tangent space
+    after some while."""
+    derivative, tangent, units, rate = here
+    n = z.size // 2
+    there = z + np.concatenate([z[n:], np.zeros(n)]) * (WHILE / rate)
+    moved = scaled_matrix(_linear(equations, there, params)[1] - derivative, units) / rate
+    size = 1.0 + np.abs(scaled_matrix(derivative, units)).max() / rate
+    turned = _tangent(equations, there, params, units)
+    if turned.shape != tangent.shape:
+        return 1.0
+    return float(
+        max(np.abs(moved @ tangent).max(initial=0.0) / size, np.abs(turned - tangent @ (tangent.T @ turned)).max(initial=0.0))
+    )
 
 
 def _units(
     energy: np.ndarray, forces: np.ndarray, metric: np.ndarray, v: np.ndarray, derivative: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """Units (2n,) of (q, v), and a rate: that of the fastest small motion, and the speeds at which a motion along each coordinate
+    """Units (2n,) of (q, v), and a rate: that of the fastest small motion, but no less than a SLOWEST part of those that the
+    matrix is made of, since where all eigenvalues are zero it is roundoff; and the speeds at which a motion along each coordinate
     has the `energy` that L has terms of, or that `forces` of these sizes give in that time, with the distances that it goes
     then. They do not depend on how near to zero the place happens to be; where nothing has a size, one energy is as good as
     another.
     """
     n, sizes = v.size, np.abs(np.diag(metric))
-    rate = np.abs(np.linalg.eigvals(derivative)).max(initial=0.0)
+    roots = np.where(sizes > 0.0, np.sqrt(sizes), 1.0)
+    springs, dampers = (scaled_matrix(part, 1.0 / roots) for part in (derivative[n:, :n], derivative[n:, n:]))
+    of_parts = max(np.sqrt(np.abs(springs).max(initial=0.0)), np.abs(dampers).max(initial=0.0))
+    rate = max(np.abs(np.linalg.eigvals(derivative)).max(initial=0.0), SLOWEST * of_parts)
     rate = float(power_of_two(np.asarray(rate))) if rate > 0.0 else 1.0
     over_masses = lambda a: np.divide(a, sizes, out=np.zeros(n), where=sizes > 0.0)
     whole = float(energy + np.abs(v) @ np.abs(metric) @ np.abs(v) + np.max(over_masses((forces / rate) ** 2), initial=0.0))

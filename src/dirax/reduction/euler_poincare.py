@@ -76,6 +76,10 @@ class EulerPoincare(AbstractSystem):
     def manifolds(self) -> dict[str, AbstractManifold]:
         return {"g": self.space.group, "q": self.space.group}
 
+    @property
+    def linearized_as(self) -> str:
+        return "linearize its .lie_poisson(), whose state x is (μ, a)"
+
     def lie_algebra_form(self) -> "EulerPoincare":
         return self
 

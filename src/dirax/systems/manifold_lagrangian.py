@@ -242,6 +242,10 @@ class ManifoldLagrangian(AbstractSystem):
         return jnp.concatenate([off, self.constraints.defect(row.get("t", 0.0), q, v, params)])
 
     @property
+    def linearized_as(self) -> str:
+        return "state it in coordinates as a dx.LagrangeDirac, or on a group linearize dx.reduce(system, group).lie_poisson()"
+
+    @property
     def projected(self) -> str:
         return "q across the constraint by its forces"
 

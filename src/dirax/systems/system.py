@@ -109,6 +109,11 @@ class AbstractSystem(eqx.Module):
         """Which schemes step it, a sentence for those that do not; empty where many do."""
         return ""
 
+    @property
+    def linearized_as(self) -> str:
+        """What is linearized in its place, a clause; empty where it is itself."""
+        return ""
+
     # ------------------------------------------------------------------ the forms in which it can be discretized
 
     def relation_form(self, shape: Shape) -> RelationForm | None:
