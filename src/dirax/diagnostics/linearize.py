@@ -94,7 +94,7 @@ class Linearization:
         error = self.error * np.abs(self.matrix).max(initial=0.0)
         values, errors = _with_errors(self.matrix, error)
         several = (np.mean(values[together]) for together in _clusters(values, errors) if len(together) > 1)
-        return any(_is_defective(self.matrix, value, error) for value in several)
+        return any(_is_defective(self.matrix, complex(value), error) for value in several)
 
     @property
     def modes(self) -> np.ndarray:

@@ -64,8 +64,9 @@ class MethodOneStep(LagrangianStep):
         return jnp.concatenate([balance, self.rows.velocity_defect(at.t, at.q, at.v, params)])
 
     def advance(self, u, state, t, h, params):
-        at, rate, momentum = self._at_base(u, self.state.split(state).q, t, h, params)
-        p1 = self.lift.last_momentum(at, rate, momentum, h)
+        q0, p0, _ = self.state.split(state)
+        at, rate, momentum = self._at_base(u, q0, t, h, params)
+        p1 = self.lift.last_momentum(p0, at, rate, momentum, h)
         return self.book.after(state, [at.q1, p1], at.t, at.q, at.v, h, params)
 
     def unpack(self, state, u, t, h, params):

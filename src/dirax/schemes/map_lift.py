@@ -83,9 +83,10 @@ class Lift(NamedTuple):
         """p0."""
         return -self.lifted(at, h * rate, momentum)[0]
 
-    def last_momentum(self, at: Base, rate: Array, momentum: Array, h: Any) -> Float[Array, " N"]:
-        """p1."""
-        return self.lifted(at, h * rate, momentum)[1]
+    def last_momentum(self, p0: Array, at: Base, rate: Array, momentum: Array, h: Any) -> Float[Array, " N"]:
+        """p1, with what is missed of the balance: v is a difference of points over h, and p has 1/h times their roundoff."""
+        minus_p0, p1 = self.lifted(at, h * rate, momentum)
+        return p1 + self.tangential(at.q1, p0 + minus_p0)
 
     def tangential(self, q: Array, vector: Array) -> Float[Array, " N"]:
         """The tangent part at q of an ambient vector."""
@@ -154,6 +155,6 @@ class ThetaLift(NamedTuple):
     def first_momentum(self, at: Base, rate: Array, momentum: Array, h: Any) -> Float[Array, " n"]:
         return momentum - (1.0 - self.theta) * h * rate
 
-    def last_momentum(self, at: Base, rate: Array, momentum: Array, h: Any) -> Float[Array, " n"]:
+    def last_momentum(self, p0: Array, at: Base, rate: Array, momentum: Array, h: Any) -> Float[Array, " n"]:
         # p0 + h ṗ, written from the base point so that p keeps to the image of the Legendre transform
         return momentum + self.theta * h * rate

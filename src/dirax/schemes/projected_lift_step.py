@@ -57,10 +57,11 @@ class ProjectedLiftStep(LagrangianStep):
         begun = p0 + rows.force(t, q0, parts.sigma, params) + minus_p0
         v1 = lift.tangents(q0, q1) @ parts.end_v
         momentum = self.rates(t + h, q1, v1, params)[1] + rows.force(t + h, q1, parts.end_sigma, params)
+        # a velocity from a difference of points has their roundoff by h: what p misses of the first balance is added to p̃1
         equations = [
             lift.paired(q0, begun),
             rows.velocity_defect(at.t, at.q, at.v, params),
-            lift.tangents(q0, q1).T @ (momentum - p1),
+            lift.tangents(q0, q1).T @ (momentum - p1 - begun),
             rows.velocity_defect(t + h, q1, v1, params),
         ]
         if rows.holonomic:
