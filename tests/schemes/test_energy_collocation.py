@@ -594,3 +594,11 @@ def test_steps_that_contract_slowly_are_solved():
         sol = dx.simulate(system, dx.EnergyCollocation(), x=[1.0, 0.2, 0.1, 0.1, 0.5, 0.3], step=step, steps=100)
         assert np.max(sol.energy_defect) < most
     assert dx.verify(sol)["steps replayed"].verdict == "ok"
+
+
+def test_why_no_form_is_checked_is_said_of_moving_constraints_too():
+    """Their work was taken for that of forces."""
+    forms, moving = lambda q: jnp.stack([jnp.sin(q[2]), -jnp.cos(q[2]), 0 * q[0]])[None], lambda q: 0.2 * jnp.cos(q[2:])
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2, forms, affine=moving)
+    sol = dx.simulate(system, dx.EnergyCollocation(2), q=[0.0, 0.0, 0.3], v=[0.0, 0.2, 0.4], step=0.02, steps=10)
+    assert "keeps the energy, and no two-form" in dx.verify(sol)["symplecticity of one step"].explanation

@@ -24,6 +24,9 @@ MOST_OPERATIONS = 4e7
 MOST = 10_001
 """Rows that are taken again at most: those of 10 000 steps."""
 
+SHORT, OF_SHORT = 500, 8e8
+"""Rows of a short run, whose steps may have so many operations."""
+
 FEWEST, CALL = 16, 2048
 """Rows that are taken again at least, and states of which a function in NumPy takes as long as of one."""
 
@@ -177,7 +180,8 @@ class Replay:
         lanes, rows = np.nonzero((np.arange(self.sol.rows)[None] <= self.ends[:, None]) & ~self.beside_walls)
         if not len(rows):
             raise CannotReplay("walls divide every step")
-        most = min(MOST, max(FEWEST, int(MOST_OPERATIONS / self.steps.operations() / self._steps_a_row)))
+        operations = OF_SHORT if len(rows) <= SHORT else MOST_OPERATIONS
+        most = min(MOST, max(FEWEST, int(operations / self.steps.operations() / self._steps_a_row)))
         if len(rows) > most:
             some = np.unique(np.linspace(0, len(rows) - 2, most // 2).astype(int))
             some = np.union1d(some, some + 1)  # with their successors

@@ -130,11 +130,11 @@ def symplecticity(sol: Solution, tolerance: float | None) -> Line:
         return Line(name, None, None, NOT_CHECKED, sol.lacks)
     if max(stage.state_size for stage, _ in sol.equation.stages) > LARGEST_STATE:
         return symplecticity_of_many(sol, name, tolerance)
-    if "work" in sol.fields and not keeps_books(sol):
-        return Line(name, None, None, NOT_CHECKED, "the forces change the two-form")
     form = sol.scheme.step_form(sol.system, shape_of(sol), sol.step)
     if isinstance(form, str):
         return Line(name, None, None, NOT_CHECKED, form)
+    if "work" in sol.fields and not keeps_books(sol):
+        return Line(name, None, None, NOT_CHECKED, "the forces change the two-form")
     if unsaved := _unsaved(form.reads, sol):
         return Line(name, None, None, NOT_CHECKED, unsaved)
     if form.points > 1 and sol.save_every != 1:
