@@ -53,7 +53,7 @@ docs: $(READY)  ## Check the spelling and build the documentation in site/, ever
 	NO_MKDOCS_2_WARNING=1 $(RUN) mkdocs build --strict
 
 soak: $(READY) fuzz  ## The long tests that `make test` leaves out
-	$(RUN) pytest -m soak
+	$(RUN) pytest -n $(WORKERS) --dist worksteal -m soak
 
 fuzz: $(READY)  ## Examine SYSTEMS=10000 random systems by every scheme against equations derived apart
 	PYTHONPATH=tests $(RUN) fuzz $(SYSTEMS)

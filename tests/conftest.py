@@ -40,6 +40,14 @@ mlir.make_ir_context = functools.cache(mlir.make_ir_context)
 atexit.unregister(jax._src.api.clean_up)  # seconds, in which all that was compiled is let go, one by one
 
 
+def pytest_itemcollected(item):
+    """`@pytest.mark.soak_of("id", …)`: of the parameters of a test those with these ids are soaked, or all `but` some."""
+    if (marker := item.get_closest_marker("soak_of")) is not None:
+        kept = marker.kwargs.get("but")
+        if item.callspec.id not in kept if kept is not None else item.callspec.id in marker.args:
+            item.add_marker("soak")
+
+
 def pytest_collection_modifyitems(items):
     """The pages of the documentation and walks through the whole package are long: they go first, so that no worker is left with
     one at the end."""

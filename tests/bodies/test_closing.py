@@ -16,6 +16,7 @@ def machine(closing, axis=(0, 1, 0), rotation="quaternion"):
 
 
 @pytest.mark.parametrize("rotation", ["quaternion", "attitude", "zxy"])
+@pytest.mark.soak_of(but=["zxy"])
 def test_a_welded_body_is_where_a_fixed_one_is(rotation):
     model = machine(b.fixed("arm", "tool", name="weld", at=(0.5, 0, 0), closes=True), rotation=rotation)
     for angle in (0.3, 1.7, 3.0, -2.5, 5.0):
@@ -26,6 +27,7 @@ def test_a_welded_body_is_where_a_fixed_one_is(rotation):
         np.testing.assert_allclose(frame.turn[:, 1], [0, 1, 0], atol=1e-10)
 
 
+@pytest.mark.soak
 def test_a_hinge_that_closes_moves_as_one_of_the_tree():
     closed = machine(b.revolute("arm", "tool", axis=(0, 0, 1), name="hinge", at=(0.5, 0, 0), closes=True), axis=(1, 0, 0))
     tree = b.Model(PAIR, [b.revolute("ground", "arm", axis=(1, 0, 0)), b.revolute("arm", "tool", (0, 0, 1), at=(0.5, 0, 0))])

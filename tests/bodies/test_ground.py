@@ -36,6 +36,7 @@ def test_a_plane_that_leans_is_a_level_one_under_other_gravity():
     )
 
 
+@pytest.mark.soak
 def test_a_wheel_in_a_round_valley_is_a_pendulum():
     """(m + J/r²)(R − r) θ̈ = −m g sin θ for an upright wheel, the contact at x = R sin θ."""
     round_, angle = 3.0, 0.6
@@ -49,6 +50,7 @@ def test_a_wheel_in_a_round_valley_is_a_pendulum():
     assert sol.ok and np.ptp(sol.energy()) < 1e-3 * MASS * 9.81 and sol.q[:, 0].min() < -0.99 * data["q"][0]
 
 
+@pytest.mark.soak
 def test_velocities_on_a_surface_are_derivatives_of_places():
     model = disc(lambda x, y: 0.3 * jnp.sin(x) + 0.2 * x * y)
     q, v = np.random.default_rng(3).uniform(0.2, 0.9, (2, 5))
@@ -59,6 +61,7 @@ def test_velocities_on_a_surface_are_derivatives_of_places():
     assert turn @ turn.T == pytest.approx(np.eye(3), abs=1e-14) and np.linalg.det(turn) > 0
 
 
+@pytest.mark.soak
 def test_symmetries_of_a_ball_that_slides_with_friction():
     """Its forces see the normal force, which is the same wherever it is."""
     ball = b.Model(

@@ -32,6 +32,7 @@ def test_a_double_pendulum_is_the_one_written_by_hand():
 
 
 @pytest.mark.parametrize("rotation", ["zxy", "quaternion"])
+@pytest.mark.soak_of(but=["zxy"])
 def test_a_free_body_keeps_momentum_and_angular_momentum_in_every_description(rotation):
     model = b.Model([b.Body("stone", **ROD, centre=(0.1, 0.2, 0.0))], [b.free("ground", "stone", rotation)], gravity=(0, 0, 0))
     n = len(model.coordinates)
@@ -63,6 +64,7 @@ def test_parameters_springs_dampers_and_motors():
     assert sol.ok and sol.params["k"] == 8.0
 
 
+@pytest.mark.soak
 def test_a_ball_rolls_in_a_bowl():
     """On z = (x² + y²)/2 · k the contact stays on the surface, and the energy of a ball that starts at rest stays."""
     model = b.Model(
@@ -112,6 +114,7 @@ def slider_crank(unit, rod=2.5):
 
 
 @pytest.mark.parametrize("unit", [2.0**-43, 2.0**-30, 2.0**35])
+@pytest.mark.soak_of(but=["1.1368683772161603e-13"])
 def test_a_machine_is_assembled_alike_in_any_unit_of_length(unit):
     """Of 1e-13 m it had no constraints, of 1e10 those too that its joints meet; and its velocities were others."""
     plain, scaled, one = slider_crank(1.0), slider_crank(unit), np.array([1.0, 1.0, unit])

@@ -22,6 +22,7 @@ def turned(model, q):
     return np.asarray(model.frames(q, np.zeros(len(q)))["top"].turn)
 
 
+@pytest.mark.soak
 def test_one_model_has_one_motion_in_all_three():
     step = {"step": 2e-3, "steps": 250, "save_every": 250}
     ends = []

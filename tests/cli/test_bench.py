@@ -41,6 +41,7 @@ def ode_of(example):
 
 
 @pytest.mark.parametrize("name", ["kepler", "rolling-disk", "vortices"])
+@pytest.mark.soak_of("vortices")
 def test_plain_jax_takes_the_steps_of_the_native_engine(name):
     s = short(name)
     state, _ = plain_run(s.one)()
@@ -49,6 +50,7 @@ def test_plain_jax_takes_the_steps_of_the_native_engine(name):
 
 @pytest.mark.skipif(importlib.util.find_spec("casadi") is None or compiler() is None, reason="needs casadi and a C compiler")
 @pytest.mark.parametrize("name", ["kepler", "rolling-disk", "dc-motor"])
+@pytest.mark.soak_of("kepler", "dc-motor")
 def test_casadi_c_takes_the_steps_of_the_native_engine(name):
     s = short(name)
     _, state, _ = casadi_c.c_run(s.one)()

@@ -134,6 +134,7 @@ def test_compare_finds_the_schemes_that_suit_a_system():
     assert [entry["scheme"] for entry in json.loads(result.stdout)["schemes"]] == ["method1", "method2"]
 
 
+@pytest.mark.soak
 def test_compare_finds_every_lagrangian_scheme_for_nonholonomic_mechanics():
     result = call("compare", "knife-edge", "--set", "steps=20", "--json")
     assert result.exit_code == 0, result.output
@@ -283,6 +284,7 @@ def test_list_and_help_do_not_import_jax():
         assert (status, err.split()) == (0, ["False", "False"]) and "reproduce" in out
 
 
+@pytest.mark.soak
 def test_the_package_is_the_program():
     run = lambda *command: subprocess.run([sys.executable, *command, "list"], capture_output=True, text=True, timeout=120)
     assert run("-m", "dirax").stdout == run("-c", "from dirax.cli import main; main()").stdout == call("list").stdout
@@ -319,6 +321,7 @@ def test_closed_streams():
 
 
 @pytest.mark.parametrize("encoding", ["latin-1", "ascii"])
+@pytest.mark.soak_of("latin-1")
 def test_encodings_that_lack_signs(encoding):
     environment = {**os.environ, "PYTHONIOENCODING": encoding, "PYTHONUTF8": "0"}
     status, out, _ = ended(program("list", env=environment))

@@ -25,6 +25,7 @@ SPACES = [
 
 
 @pytest.mark.parametrize(("group", "advected", "names"), SPACES)
+@pytest.mark.soak_of(but=["group0-0-names0", "group1-2-names1", "group2-0-names2", "group4-0-names4"])
 def test_casimirs_are_all_null_directions_of_the_bivector(group, advected, names):
     space = SemidirectProduct(group, advected)
     found = casimirs(space)
@@ -41,6 +42,7 @@ def conserved(sol):
 
 
 @pytest.mark.parametrize(("name", "count"), [("free-top", 3), ("heavy-top-so3", 1), ("underwater-vehicle", 4)])
+@pytest.mark.soak_of(but=["underwater-vehicle-4"])
 def test_gallery_conserves_them(name, count):
     sol = gallery.get(name).simulate(steps=300)
     lines = conserved(sol)
@@ -53,6 +55,7 @@ def test_gallery_conserves_them(name, count):
     assert list(lifted) == list(lines) and all(line.verdict == "ok" for line in lifted.values())
 
 
+@pytest.mark.soak
 def test_damage_is_seen_in_the_worst_trajectory_of_a_batch():
     body = dx.EulerPoincare(dx.SO3(), lambda xi: xi @ (jnp.array([1.0, 2.0, 3.0]) * xi) / 2)
     start = body.state([[0.3, 1.0, 0.4], [1.0, 0.2, 0.1]])

@@ -18,6 +18,7 @@ def slope_by_hand(h, errors):
 @pytest.mark.parametrize(
     "scheme, order", [(dx.PlusLagrangeDirac(), 1), (dx.MinusLagrangeDirac(), 1), (dx.LagrangeDAlembert(), 2)]
 )
+@pytest.mark.soak_of(but=["scheme1-1"])
 def test_orders_on_the_rolling_disk_in_q_p_and_multipliers(scheme, order):
     disk = gallery.get("rolling-disk")
     found = dx.convergence(
@@ -34,6 +35,7 @@ def test_orders_on_the_rolling_disk_in_q_p_and_multipliers(scheme, order):
 
 @pytest.mark.parametrize("rule", ["midpoint", "trapezoidal"])
 @pytest.mark.parametrize("name", ["kepler", "double-pendulum"])
+@pytest.mark.soak_of(but=["kepler-trapezoidal"])
 def test_second_order_against_an_independent_solution(rule, name):
     example = gallery.get(name)
     system, n = example.system, len(example.coordinates)
@@ -180,6 +182,7 @@ def test_a_scheme_that_converges_to_something_else_has_no_order():
     assert "does not come to" in table["Heavier"].note
 
 
+@pytest.mark.soak
 def test_orders_and_errors_in_other_units():
     """A skate in x = (q, p): by one norm of metres and momenta the order was 2.988 with a mass of 1, and 2 with one of 2⁻⁴⁰."""
     skate = dx.HamiltonDirac(

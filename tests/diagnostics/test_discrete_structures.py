@@ -48,6 +48,7 @@ METHOD_ONE = [
 
 
 @pytest.mark.parametrize(("system", "scheme", "start"), METHOD_ONE)
+@pytest.mark.soak_of("system0-scheme0-start0", "system1-scheme1-start1", "system2-scheme2-start2", "system5-scheme5-start5")
 def test_steps_by_maps_are_in_their_structure_and_damage_is_seen(system, scheme, start):
     lines = lambda sol: {line.quantity: line for line in membership(sol, structure_of(sol), None)}
     sol = dx.simulate(system, scheme, step=0.05, steps=20, check_initial=False, engine="native", **start)
@@ -75,6 +76,7 @@ def test_implicit_systems_and_the_sentences_of_others():
         assert line.verdict == "not checked" and words in line.explanation
 
 
+@pytest.mark.soak
 def test_charts_change_and_the_step_stays_symplectic():
     system = dx.ManifoldLagrangian(lambda q, v: v @ v / 2 - 3 * q[2], dx.Sphere(3))
     start = {"q": [0.6, 0.0, 0.8], "v": [0.4, 0.3, -0.3], "step": 0.05, "steps": 40}
@@ -183,6 +185,7 @@ LINES = [
 
 
 @pytest.mark.parametrize(("kind", "scheme", "says"), LINES)
+@pytest.mark.soak_of("sphere-scheme6-ok", "sphere-scheme7-ok")
 def test_the_form_whose_graph_d_is_and_that_of_a_manifold(kind, scheme, says):
     system, start = KINDS[kind]
     line = dx.verify(dx.simulate(system, scheme, step=0.1, steps=6, **start))["symplecticity of one step"]

@@ -31,6 +31,7 @@ def sol():
     return dx.simulate(BALL, dx.LagrangeDAlembert(), step=0.05, steps=120, **ROOM)
 
 
+@pytest.mark.soak
 def test_the_run_once_more_has_the_same_bits(sol):
     assert len(sol.impacts) >= 5
     again = run_again(sol)
@@ -65,6 +66,7 @@ def test_a_trajectory_that_an_event_ends_has_no_impacts_after_it():
 
 
 @pytest.mark.parametrize("step, steps", [(1.1, 10), (0.5, 1)])
+@pytest.mark.soak_of("1.1-10")
 def test_walls_may_divide_every_step(step, steps):
     """It raised NumPy's ValueError."""
     free = dx.LagrangeDirac(lambda q, v: v @ v / 2)

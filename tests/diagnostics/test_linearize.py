@@ -35,6 +35,7 @@ def test_a_rod_with_its_length_as_a_constraint_swings_as_fast():
     assert found.matrix.shape == (2, 2) and found.eigenvalues == pytest.approx([3j, -3j], abs=1e-14)
 
 
+@pytest.mark.soak
 def test_a_constraint_said_twice_changes_nothing():
     once = lambda q: jnp.array([q @ q - 1.0])
     twice = lambda q: jnp.array([q @ q - 1.0, 2.0 * q @ q - 2.0])
@@ -147,6 +148,7 @@ def in_units(length, mass, time):
 
 
 @pytest.mark.parametrize("units", [(2.0**-30, 2.0**-86, 2.0**-40), (2.0**37, 2.0**81, 2.0**25), (2.0**-50, 2.0**90, 2.0**3)])
+@pytest.mark.soak_of(but=["units2"])
 def test_linear_equations_in_other_units(units):
     """Nanometres and planets in metres: an orbit was called an equilibrium at rest, since 6e-3 is small beside 3e4."""
     found = {}
@@ -195,6 +197,7 @@ def test_a_weight_that_falls_from_zero_is_at_no_equilibrium_in_any_units():
 
 @pytest.mark.parametrize("scheme", [None, dx.LagrangeDAlembert(), dx.Composition(dx.LagrangeDAlembert(), "suzuki4")])
 @pytest.mark.parametrize("unit", [1.0, 2.0**-40])
+@pytest.mark.soak_of("1.0-scheme2", "9.094947017729282e-13-scheme2")
 def test_a_slow_motion_that_grows_is_seen_beside_a_fast_one(scheme, unit):
     """A pendulum up or down beside a mode of 1 MHz, and two masses on a spring, which move together as if free."""
     fast = 2 * np.pi * 1e6 / unit
@@ -250,6 +253,7 @@ def at_rest():
         (dx.EnergyCollocation(2, points=2), 1e-6),
     ],
 )
+@pytest.mark.soak_of("scheme2-1e-06")
 def test_steps_with_multipliers_or_the_energy_in_their_state(scheme, error, at_rest):
     """A constraint that pushes where the system is at rest, and depends on the place. The multiplier in the state of collocation
     has an eigenvalue of its own, near 1 or −1, that is none of the system."""

@@ -37,6 +37,7 @@ SYMPLECTIC = {
 
 
 @pytest.mark.parametrize("kind", SYMPLECTIC)
+@pytest.mark.soak_of(but=["lagrange"])
 def test_a_step_preserves_its_form_in_any_units(kind):
     whole = dx.reconstruct if kind in ("routh", "quotient") else lambda sol: sol  # what verify asks the form of
     found = [symplecticity(whole(SYMPLECTIC[kind](unit)), None) for unit in (1.0, 2.0**20, 2.0**-9, 1e7)]
@@ -77,6 +78,7 @@ def test_a_billionth_that_a_step_loses_is_found_in_any_units():
 
 
 @pytest.mark.parametrize("engine", ["native", "xla"])
+@pytest.mark.soak_of("xla")
 def test_steps_by_collocation_are_solved_whatever_the_mass(engine):
     run = lambda m: dx.simulate(KEPLER, dx.Collocation(2), q=[1.0, 0.0], v=[0.0, 1.2], params=m, step=0.1, steps=9, engine=engine)
     lines = [dx.verify(run(m))["steps solved"] for m in (1.0, 2.0**-30, 2.0**60)]
@@ -92,6 +94,7 @@ def test_steps_at_an_equilibrium_are_solved(scheme):
 
 
 @pytest.mark.parametrize("scheme", [dx.DiscreteDirac(), dx.DiscreteGradient()])
+@pytest.mark.soak
 def test_steps_are_replayed_in_any_units(scheme):
     """The momentum of a top of 1e-25 beside its direction of size 1: steps were taken again with a billionth of their digits."""
     found = []

@@ -30,6 +30,7 @@ def verdict(sol):
 
 
 @pytest.mark.parametrize("rows", [None, np.array([[1.0, 0.3, 0.0]])], ids=["free", "Suslov"])
+@pytest.mark.soak_of("Suslov")
 def test_every_element_of_the_group_is_asked_for_the_first_one_too(rows):
     top = dx.EulerPoincare(SO3, lambda xi: xi @ (INERTIA * xi) / 2, rows)
     sol = dx.simulate(top, dx.DiscreteEulerPoincare(), x=top.state(np.array([-0.3, 1.0, 0.5])), step=0.05, steps=12)
@@ -47,6 +48,7 @@ def bead(q, v):
 @pytest.mark.parametrize(
     "scheme", [dx.LagrangeDAlembert(), dx.DiscreteDirac(dx.ProductMap((dx.SphereProjection(), 3), (dx.Midpoint(), 1)))]
 )
+@pytest.mark.soak_of("scheme0")
 def test_points_of_a_sphere_in_batches_and_from_files(scheme, tmp_path):
     system = dx.ManifoldLagrangian(bead, dx.Product(dx.Sphere(3), dx.Euclidean(1)))
     q = np.array([[0.6, 0.0, 0.8, 0.3], [0.0, 1.0, 0.0, 0.0]])
@@ -96,6 +98,7 @@ def test_reconstructed_motions_on_a_bundle_in_charts_are_right(tmp_path):
 
 
 @pytest.mark.parametrize("scheme", [dx.LagrangeDAlembert(), dx.Composition(dx.LagrangeDAlembert(), "suzuki4")])
+@pytest.mark.soak_of("scheme1")
 def test_a_constraint_is_off_by_the_roundings_of_the_points_that_are_subtracted(scheme):
     """ε|q|/h, which is more the shorter a step, and its parts."""
     system = dx.ManifoldLagrangian(lambda q, v: v @ v / 2 - q @ q / 2, dx.Euclidean(3), lambda q: jnp.array([[-0.3, q[0], 1.0]]))

@@ -101,11 +101,13 @@ def assert_seen(sol, but: tuple[str, ...] = (), alone: bool = False):
 
 
 @pytest.mark.parametrize("name", RUNS)
+@pytest.mark.soak_of(but=["plus", "minus", "Method 1", "adjoint", "collocation"])
 def test_every_damage_is_seen(name):
     assert_seen(run(name))
 
 
 @pytest.mark.parametrize("name", ["plain", pytest.param("composed", marks=pytest.mark.soak), "discrete gradient", "holonomic"])
+@pytest.mark.soak
 def test_also_where_not_every_step_is_saved(name):
     assert_seen(run(name, save_every=7))
 
@@ -114,6 +116,7 @@ FAR = 10_000
 
 
 @pytest.mark.parametrize("name", ["plain", "holonomic", "discrete gradient"])
+@pytest.mark.soak_of("plain", "holonomic")
 def test_also_where_rows_are_far_apart(name):
     """In a moment: the steps are taken by the engine of the run."""
     sol = run(name, step=0.005, steps=3 * FAR, save_every=FAR)
@@ -128,6 +131,7 @@ def test_also_where_rows_are_far_apart(name):
 
 
 @pytest.mark.parametrize(("apart", "verdict"), [(100, "ok"), (1000, "ok"), (FAR, "not checked")])
+@pytest.mark.soak_of("100-ok")
 def test_roundoff_that_many_chaotic_steps_enlarge_is_no_damage(apart, verdict):
     potential = lambda q: 9.81 * (2 * jnp.cos(q[0]) + jnp.cos(q[1]))
     system = dx.LagrangeDirac(lambda q, v: v[0] ** 2 + v[1] ** 2 / 2 + v[0] * v[1] * jnp.cos(q[0] - q[1]) + potential(q))
@@ -151,6 +155,7 @@ def hanging(links):
 
 
 @pytest.mark.parametrize(("scheme", "links"), [(MIDPOINT, 12), (dx.DiscreteDirac(constraints="resolve"), 5)])
+@pytest.mark.soak
 def test_also_of_many_unknowns(scheme, links):
     q = np.stack([np.arange(1, links + 1) / links, np.zeros(links)], axis=1).ravel()
     sol = dx.simulate(hanging(links), scheme, q=q, v=0 * q, step=1e-3, steps=10, save_every=2)
@@ -175,6 +180,7 @@ def test_also_from_two_points(scheme):
     assert_seen(dx.simulate(angle, scheme, q0=[0.5], q1=[0.51], step=0.02, steps=60))
 
 
+@pytest.mark.soak
 def test_also_on_manifolds():
     sphere = dx.Sphere(3)
     system = dx.ManifoldLagrangian(lambda q, v: v @ v / 2 - 9.81 * q[2], sphere)
@@ -182,6 +188,7 @@ def test_also_on_manifolds():
         assert_seen(dx.simulate(system, scheme, q=[1.0, 0.0, 0.0], v=[0.0, 2.0, 0.0], step=0.05, steps=60))
 
 
+@pytest.mark.soak
 def test_a_run_that_fails_is_replayed_up_to_its_end():
     falling = dx.LagrangeDirac(lambda q, v: v @ v / 2 - jnp.log(q[0]))
     sol = dx.simulate(falling, MIDPOINT, q=[1.0], v=[0.0], step=0.1, steps=60)
@@ -190,6 +197,7 @@ def test_a_run_that_fails_is_replayed_up_to_its_end():
     assert_seen(sol)
 
 
+@pytest.mark.soak
 def test_the_xla_engine_compensated_sums_and_files(tmp_path):
     for options in ({"engine": "xla"}, {"compensated": True}):
         assert replayed(run("plain", **options), None).verdict == "ok"
@@ -224,6 +232,7 @@ def test_another_solution_of_the_equations_of_a_step_is_one():
 
 
 @pytest.mark.parametrize(("scheme", "width", "rows"), [("yoshida4", 2e-3, (40, -1)), ("suzuki4", 5e-4, (-1,))])
+@pytest.mark.soak
 def test_also_of_several_solutions_of_parts_of_steps(scheme, width, rows):
     """A block that comes to rest by friction: back in time it may have come from either side, or have rested."""
     block = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q / 2, forces=lambda t, q, v: -0.3 * jnp.tanh(v / width))
@@ -256,6 +265,7 @@ RUNS_OF_SEVERAL_ROOTS = [
 
 
 @pytest.mark.parametrize(("h", "seed", "steps", "damages"), RUNS_OF_SEVERAL_ROOTS)
+@pytest.mark.soak
 def test_also_where_the_step_after_says_what_a_row_holds(h, seed, steps, damages):
     """Mean momenta belong to the steps on both sides, each with several solutions; the last two runs fail, and no step says which
     momentum their last row has. The last one is followed rightly only from a very short step on, which takes its time."""
@@ -278,6 +288,7 @@ def test_also_where_the_step_after_says_what_a_row_holds(h, seed, steps, damages
         ("suslov", None),
     ],
 )
+@pytest.mark.soak_of(but=["knife-edge-scheme0"])
 def test_a_part_of_a_run_is_right_where_the_run_is(name, scheme):
     """Its first row is none that a run began at: what no row holds goes on from there. A damage is seen as in the whole."""
     part = gallery.get(name).simulate(*([scheme] if scheme else []), steps=14)[4:11]
@@ -290,6 +301,7 @@ def test_a_part_of_a_run_is_right_where_the_run_is(name, scheme):
 
 @pytest.mark.parametrize("scheme", [dx.LagrangeDAlembert(), dx.LagrangeDAlembert("left"), dx.LagrangeDAlembert("trapezoidal")])
 @pytest.mark.parametrize("way", ["held", "interpolated"])
+@pytest.mark.soak_of(but=["held-scheme1"])
 def test_a_control_in_a_table_hides_no_damage(scheme, way):
     """Rounding noise moved the index: what the steps say seemed to be known to nothing. t/h is a whole number at every row."""
     h, steps = 0.1, 50

@@ -26,6 +26,7 @@ RUNS = [  # each has lines that the sizes of terms alone would call violated
 
 
 @pytest.mark.parametrize(("name", "scheme", "steps"), RUNS)
+@pytest.mark.soak_of(but=["euler-disk-scheme2-600", "double-spherical-pendulum-None-1000"])
 def test_right_runs_are_right_and_damage_is_seen(name, scheme, steps):
     example = gallery.get(name)
     sol = example.simulate(scheme, **({"steps": steps} if steps else {}))
@@ -48,6 +49,7 @@ def test_noise_finds_what_cancels_inside():
     assert abs(np.mean(off) - 0.5) < 0.03
 
 
+@pytest.mark.soak
 def test_a_decomposition_in_the_potential_is_no_violation():
     """The midpoint rule of a smooth Lagrangian; its operations cannot be disturbed one by one."""
 

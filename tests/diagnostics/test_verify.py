@@ -124,6 +124,7 @@ def kepler():
 
 
 @pytest.mark.parametrize(("name", "direction"), [("plus", 1), ("minus", -1)])
+@pytest.mark.soak
 def test_the_energy_of_the_one_sided_schemes_on_the_disk_drifts(request, name, direction):
     sol, report = (request.getfixturevalue(f"{name}_{what}") for what in ("disk", "report"))
     energy = np.asarray(sol.energy())
@@ -155,6 +156,7 @@ def test_everything_else_holds_on_the_disk(request, name):
     assert "the pair given at the start is off by" in report["constraint"].explanation
 
 
+@pytest.mark.soak
 def test_the_midpoint_scheme_on_the_disk_is_bounded():
     report = verify(run_disk(dx.LagrangeDAlembert(), 20_000))
     assert report["energy"].verdict == "bounded"
@@ -162,6 +164,7 @@ def test_the_midpoint_scheme_on_the_disk_is_bounded():
 
 
 @pytest.mark.parametrize(("coordinate", "row"), [(0, 700), (2, 1), (3, 9_000)])
+@pytest.mark.soak
 def test_a_point_moved_by_a_millionth_is_found(short_disk, coordinate, row):
     q = np.array(short_disk.q)
     q[row, coordinate] += 1e-6
@@ -172,6 +175,7 @@ def test_a_point_moved_by_a_millionth_is_found(short_disk, coordinate, row):
 
 
 @pytest.mark.parametrize("name", ["p", "multipliers"])
+@pytest.mark.soak_of("p")
 def test_a_wrong_momentum_or_multiplier_is_found(short_disk, name):
     values = np.array(getattr(short_disk, name))
     values[300, 1] += 1e-6
@@ -230,6 +234,7 @@ def complex_step(function, z):
     return np.stack(columns, axis=1)
 
 
+@pytest.mark.soak
 def test_the_structural_relation_agrees_with_an_independent_computation(minus_disk):
     h, (q0, q1) = 1e-3, np.asarray(minus_disk.q)[5000:5002]
     z = np.concatenate([q0, q1])
@@ -255,6 +260,7 @@ def test_the_structural_relation_agrees_with_an_independent_computation(minus_di
     assert np.linalg.norm(without) == pytest.approx(np.linalg.norm(tangent.T @ change @ tangent), rel=1e-9)
 
 
+@pytest.mark.soak
 def test_a_force_outside_the_annihilator_breaks_the_structural_relation():
     """The Heisenberg system, judged by constraint forces of other one-forms than those that act."""
     free = lambda q, v: v @ v / 2
@@ -308,6 +314,7 @@ def test_a_pendulum_at_rest_has_the_momenta_of_its_roundings():
     assert verify(sol.replace(fields=sol.fields | {"p": off}))["hidden constraint"].verdict == "VIOLATED"
 
 
+@pytest.mark.soak
 def test_two_links_that_hang_straight_have_the_velocities_of_their_roundings():
     """Both constraints by Lobatto's nodes, whose velocities are roundings; one that is not is seen."""
     links = lambda q: jnp.stack([q[0] ** 2 + q[1] ** 2 - 1.0, (q[2] - q[0]) ** 2 + (q[3] - q[1]) ** 2 - 0.49])
@@ -326,6 +333,7 @@ def test_a_composition_is_symplectic_in_unbalanced_units():
     assert report["discrete Dirac structure"].verdict == "not checked"
 
 
+@pytest.mark.soak
 def test_a_composition_with_several_holonomic_constraints_is_measured():
     sol = gallery.get("cartesian-double-pendulum").simulate(dx.Composition(dx.LagrangeDAlembert(), "yoshida4"), steps=20)
     report = verify(sol)
@@ -424,6 +432,7 @@ def test_a_loaded_solution_is_checked_without_its_system(kepler, tmp_path):
     assert complete["(+)-discrete Dirac structure"].verdict == "ok"
 
 
+@pytest.mark.soak
 def test_the_tolerance_can_be_set(kepler):
     assert verify(kepler, tolerance=1e-30)["symplecticity of one step"].verdict == "VIOLATED"
     assert verify(kepler, [0], tolerance=2.0)["momentum map p[0]"].verdict == "ok"
@@ -438,6 +447,7 @@ def test_method_one_is_not_blamed_for_its_rows():
     assert line.value > 1e-9
 
 
+@pytest.mark.soak
 def test_steps_of_a_discretization_map_are_in_its_dirac_structure():
     so3 = dx.DiracStructure.from_bivector(lambda x: jnp.array([[0.0, -x[2], x[1]], [x[2], 0.0, -x[0]], [-x[1], x[0], 0.0]]))
     body = dx.DiracSystem(so3, lambda x: x @ (x / jnp.array([1.0, 2.0, 3.0])) / 2)
@@ -526,6 +536,7 @@ TIMES = np.linspace(0.0, 100.0, 4000)
     amplitudes=st.lists(st.floats(0.01, 10.0), min_size=4, max_size=4),
     phases=st.lists(st.floats(0.0, 6.3), min_size=4, max_size=4),
 )
+@pytest.mark.soak
 def test_no_quasi_periodic_series_drifts(cycles, amplitudes, phases):
     waves = zip(cycles, amplitudes, phases, strict=False)
     series = sum(a * np.sin(2 * np.pi * c * TIMES / 100 + p) for c, a, p in waves)
@@ -534,6 +545,7 @@ def test_no_quasi_periodic_series_drifts(cycles, amplitudes, phases):
 
 @settings(max_examples=100, deadline=None)
 @given(cycles=st.floats(10.0, 300.0), phase=st.floats(0.0, 6.3), way=st.floats(1.5, 1e3), power=st.floats(0.5, 3.0))
+@pytest.mark.soak
 def test_a_trend_wider_than_the_oscillation_drifts(cycles, phase, way, power):
     series = np.sin(2 * np.pi * cycles * TIMES / 100 + phase) + 2 * way * (TIMES / 100) ** power
     found = judge(TIMES, series, MOTION, 1e-12)
@@ -659,6 +671,7 @@ def test_which_trajectories_of_a_batch_go_across_a_jump_is_told():
     assert line.verdict == "VIOLATED" and line.value == 2.0 and "(trajectory 1)" in line.explanation
 
 
+@pytest.mark.soak
 def test_a_residual_is_judged_against_the_size_of_its_terms():
     for unit in (1.0, 1e30, 1e-30):
         system = dx.LagrangeDirac(lambda q, v, unit=unit: unit * (v @ v / 2 - jnp.sum(jnp.cos(q))))
@@ -670,6 +683,7 @@ def test_a_residual_is_judged_against_the_size_of_its_terms():
 
 
 @pytest.mark.parametrize("scheme", [dx.LagrangeDAlembert(), dx.Composition(dx.LagrangeDAlembert(), "yoshida4")])
+@pytest.mark.soak_of("scheme0")
 def test_short_steps_of_light_bodies_are_solved(scheme):
     """A constraint over a step of 1e-6 is known to ε|q|²/h, while the momenta of light bodies are small beside that."""
     mass, start = jnp.repeat(jnp.array([1.0, 1e-6]), 2), np.array([0.6, -0.8, 0.68, -0.86])
@@ -787,6 +801,7 @@ def test_lagrangians_that_are_regular_on_the_way_are_not_accused(lagrangian, mor
 
 
 @pytest.mark.parametrize("way", ["as stated", "resolved"])
+@pytest.mark.soak_of("resolved")
 def test_what_equations_do_to_the_energy_is_measured_where_they_alone_say_it(way):
     """A capacitor at rest that a source charges was called VIOLATED, and one that a resistor discharges bounded."""
     resolved = dx.DiscreteDirac(constraints="resolve")
@@ -805,6 +820,7 @@ def test_what_equations_do_to_the_energy_is_measured_where_they_alone_say_it(way
 
 
 @pytest.mark.parametrize("kind", ["a Hamiltonian", "a submanifold"])
+@pytest.mark.soak
 def test_the_rows_of_a_large_two_form_have_its_roundings(kind):
     """Those of a strong magnetic field, which constrain nothing, were called VIOLATED by 10⁻¹². A third coordinate without a
     velocity is constrained, and that by no more than its own terms say."""

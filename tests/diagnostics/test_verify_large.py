@@ -48,6 +48,7 @@ def test_a_right_run_passes(sol, monkeypatch):
     assert lines[SYMPLECTIC].verdict == "ok" and "2 pairs of random directions at 2 of 12 rows" in lines[SYMPLECTIC].explanation
 
 
+@pytest.mark.soak
 def test_nothing_of_a_machine_is_compiled(monkeypatch):
     """The derivative of a step of the bicycle has 441 numbers: XLA took half a minute for what the scalar program does in two
     seconds."""
@@ -55,6 +56,7 @@ def test_nothing_of_a_machine_is_compiled(monkeypatch):
     assert dx.verify(gallery.get("bicycle").simulate(steps=20)).ok
 
 
+@pytest.mark.soak
 def test_changed_numbers_are_found(sol):
     q, p = sol.q.copy(), sol.p.copy()
     q[6, 293] *= 1.0 + 1e-11
@@ -65,6 +67,7 @@ def test_changed_numbers_are_found(sol):
     assert {line.quantity: line.verdict for line in lines} == dict.fromkeys(JUDGED, VIOLATED)
 
 
+@pytest.mark.soak
 def test_a_step_that_changes_the_form_is_found(sol):
     equation = sol.equation
     stretched = dataclasses.replace(equation, advance=lambda *given: (1.0 + 1e-9) * equation.advance(*given))
@@ -72,6 +75,7 @@ def test_a_step_that_changes_the_form_is_found(sol):
 
 
 @pytest.mark.parametrize("save_every", [1, 3])
+@pytest.mark.soak_of("1")
 def test_multipliers_are_those_of_momenta_that_rows_do_not_hold(save_every):
     """Rows hold mean momenta, and multipliers belong to incoming ones: they are compared one row later."""
     knife = dx.LagrangeDirac(

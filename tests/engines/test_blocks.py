@@ -120,6 +120,7 @@ def test_pivots_of_masses_with_constraints_vanish_nowhere(random):
         np.testing.assert_allclose(found, np.linalg.solve(dense, values), rtol=1e-11)
 
 
+@pytest.mark.soak
 def test_the_bicycle_is_eliminated_alike_wherever_it_heads(random):
     """The pivots of its accelerations and multipliers, in the midst of a step of Method 2, upright and straight: entries of
     constraints by pitch, roll and steer vanish, and others where it heads along an axis."""
@@ -163,6 +164,7 @@ def test_entries_are_the_same_only_where_they_are_so_everywhere():
     assert symmetric_signs(g, [[two, square], [square, two]]) == [1, 1]
 
 
+@pytest.mark.soak
 def test_saved_velocities_are_a_block_of_their_own():
     """The unknowns of a constrained step are those that move it and those of the saved momentum, which are linear."""
     case = gallery.get("hanging-chain")
@@ -178,6 +180,7 @@ def test_saved_velocities_are_a_block_of_their_own():
     np.testing.assert_allclose(sol.p, plain.p, rtol=1e-10, atol=1e-10 * np.abs(plain.p).max())
 
 
+@pytest.mark.soak
 def test_method_2_corrects_accelerations_after_the_step_that_hardly_depends_on_them():
     case, scheme = gallery.get("hanging-chain"), dx.DiscreteDirac(constraints="resolve")
     sol = case.simulate(scheme, steps=40, engine="native")

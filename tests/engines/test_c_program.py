@@ -44,6 +44,7 @@ def columns(found, name):
         ("kepler", dx.VariableSteps(dx.LagrangeDAlembert(), lambda q: (q @ q) ** -0.75)),
     ],
 )
+@pytest.mark.soak_of("double-pendulum-scheme0", "chaplygin-sphere-scheme3", "kepler-scheme5")
 def test_the_rows_have_the_bits_of_the_run(tmp_path, name, scheme):
     example, path = gallery.get(name), tmp_path / "run.c"
     settings = {**example.initial, "params": example.params, "step": example.step, "steps": 200, "save_every": 9}

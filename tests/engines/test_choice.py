@@ -21,6 +21,7 @@ def potential(differences):
     return dx.LagrangeDirac(lambda q, v: v @ v / 2 - jnp.sum(1 - jnp.cos(differences(q))) - q @ q / 2)
 
 
+@pytest.mark.soak
 def test_sparse_steps_beyond_the_size_of_full_ones_are_native():
     neighbours = dx.simulate(potential(jnp.diff), dx.LagrangeDAlembert(), **RUN)
     assert 2 * N > choice.LARGEST_FULL and neighbours.stats["engine"] == "native"
@@ -30,6 +31,7 @@ def test_sparse_steps_beyond_the_size_of_full_ones_are_native():
     np.testing.assert_allclose(again.q, neighbours.q, atol=1e-12)
 
 
+@pytest.mark.soak
 def test_too_large_a_step_says_its_size():
     size = choice.LARGEST_NATIVE // 2 + 1
     large = dx.simulate(potential(jnp.diff), dx.LagrangeDAlembert(), q=np.zeros(size), v=np.ones(size), step=0.01, steps=1)
@@ -37,6 +39,7 @@ def test_too_large_a_step_says_its_size():
 
 
 @pytest.mark.parametrize("nested", [False, True])
+@pytest.mark.soak_of("True")
 def test_operations_do_not_matter_where_an_array_program_would_be_far_larger(nested, monkeypatch):
     """L = v²/2 − x² − λ y in three coordinates: a chain whose steps differentiate its constraints again and again."""
     monkeypatch.setattr(choice, "LARGEST_FULL", 3)

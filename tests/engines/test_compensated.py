@@ -31,6 +31,7 @@ def drift(name: str, engine: str, compensated: bool, steps: int, scheme=None, ba
 
 @pytest.mark.parametrize("engine", ["native", "xla"])
 @pytest.mark.parametrize("name", RUNS)
+@pytest.mark.soak_of("energy of the oscillator-xla", "angular momentum-xla")
 def test_conserved_quantities_do_not_drift(name, engine):
     steps = 200_000 if engine == "native" else 20_000
     assert np.max(drift(name, engine, True, steps)) < 8 * EPSILON  # of which the rounding of the saved rows is half
@@ -43,6 +44,7 @@ def test_compositions_and_batches_on_the_xla_engine():
     assert found.shape == (3, 101) and np.max(found) < 8 * EPSILON
 
 
+@pytest.mark.soak
 def test_derivatives_are_those_of_the_plain_run():
     def end(q, engine, compensated):
         sol = dx.simulate(

@@ -42,6 +42,7 @@ def test_unknowns_that_become_far_larger_on_the_way():
     assert unknowns[0, 0] == pytest.approx(brentq(lambda v: v - p - force(v), -1.0, 1.0, xtol=1e-18), rel=1e-9)
 
 
+@pytest.mark.soak
 def test_a_failed_step_says_where_solutions_turn_back():
     """The turning point of two stages at t = .7 is .0835 by a continuation with other steps and scales; three have none."""
     example = gallery.get("cartesian-double-pendulum")
@@ -67,6 +68,7 @@ def block(steps, q=(3.0,), mu=MU, slip=SLIP, **options):
 
 @pytest.mark.parametrize("engine", ["native", "xla"])
 @pytest.mark.parametrize("slip", [SLIP, 1e-5])
+@pytest.mark.soak_of(but=["0.001-native"])
 def test_where_friction_stops_a_block(slip, engine):
     """Against the roots of the same equations in one number, which brackets find: at rest its velocity alternates, and what steps
     before say of it leads the wrong way."""
@@ -80,6 +82,7 @@ def test_where_friction_stops_a_block(slip, engine):
 
 
 @pytest.mark.parametrize("engine", ["native", "xla"])
+@pytest.mark.soak_of("native")
 def test_bits_of_a_block_that_friction_stops(engine):
     """Ever so many trajectories that stop in different steps: natively each has the bits that it has alone."""
     sol = block(220, q=[2.0], engine=engine)
@@ -90,6 +93,7 @@ def test_bits_of_a_block_that_friction_stops(engine):
     np.testing.assert_allclose(many.q[1, :-1], sol.q[::10], rtol=0.0, atol=1e-14 if engine == "xla" else 0.0)
 
 
+@pytest.mark.soak
 def test_many_that_stop_have_the_bits_of_each_alone():
     """A bead on a hoop under friction of its normal force, of several unknowns: those of the others set no scale."""
     friction = lambda t, q, v, multipliers: -0.4 * jnp.abs(multipliers[0]) * v / jnp.sqrt(v @ v + 1e-8)
@@ -103,6 +107,7 @@ def test_many_that_stop_have_the_bits_of_each_alone():
     assert np.array_equal(run([0, 0]).q[0], both.q[0])
 
 
+@pytest.mark.soak
 def test_its_derivative():
     end = lambda mu: block(400, mu=mu).q[-1, 0]
     assert jax.grad(end)(MU) == pytest.approx((end(MU + 1e-6) - end(MU - 1e-6)) / 2e-6, rel=1e-6)

@@ -22,6 +22,7 @@ def run(scheme, **more):
     return dx.simulate(SYSTEM, scheme, **(START | {"step": 1e-3, "steps": 40, "engine": "xla"} | more))
 
 
+@pytest.mark.soak
 def test_steps_written_in_scalars_are_the_steps(monkeypatch):
     """Against the native engine: a composition of two equations, and a batch with parameters of its own."""
     c = {"g": np.array([1.0, 9.81, 3.0])}
@@ -48,6 +49,7 @@ def test_derivatives_through_scalars(monkeypatch):
     np.testing.assert_allclose(scalar, plain, rtol=1e-11)
 
 
+@pytest.mark.soak
 def test_method_2_in_large_batches_with_the_jacobian_of_the_graph():
     """Against the native engine, to roundoff: one stage and five equal ones, which are compiled once."""
     metric = lambda q: jnp.diag(jnp.stack([1.0 + q[1] ** 2, jnp.ones(())]))

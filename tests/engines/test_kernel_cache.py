@@ -266,6 +266,7 @@ print(hits)
 """
 
 
+@pytest.mark.soak
 def test_several_processes_share_it(folder, monkeypatch):
     monkeypatch.setenv("DIRAX_CACHE_FILES", "8")
     source = str(Path(dx.__file__).parent)
@@ -277,6 +278,7 @@ def test_several_processes_share_it(folder, monkeypatch):
     assert not list(folder.glob(f"*{private_folder.UNFINISHED}"))
 
 
+@pytest.mark.soak
 def test_a_run_goes_on_whatever_is_in_the_cache(folder):
     system = dx.LagrangeDirac(lambda q, v: v @ v / 2 + jnp.cos(q[0]))
     run = lambda: dx.simulate(system, dx.LagrangeDAlembert(), q=[1.0], v=[0.0], step=0.01, steps=20, engine="native")

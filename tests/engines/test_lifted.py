@@ -38,6 +38,7 @@ def run(system, scheme, momentum=MOMENTUM, scale=1.3, steps=40, **more):
 
 
 @pytest.mark.parametrize("scheme", SCHEMES.values(), ids=SCHEMES)
+@pytest.mark.soak_of("collocation", "energy collocation", "variable steps")
 def test_steps_with_roots_are_those_of_the_formula_of_the_root(scheme):
     found, known = run(BY_ROOTS, scheme), run(BY_FORMULA, scheme)
     assert found.stats["engine"] == known.stats["engine"] == "native"
@@ -54,6 +55,7 @@ def test_such_a_run_is_verified_and_goes_on():
     assert sol.at(0.33).x == pytest.approx(known.at(0.33).x, abs=1e-13)
 
 
+@pytest.mark.soak
 def test_its_derivatives_are_those_of_the_formula_of_the_root():
     def end(system, momentum, scale):
         return jnp.sum(run(system, SCHEMES["collocation"], momentum, scale).x[-1] ** 2 * INERTIA)
@@ -63,6 +65,7 @@ def test_its_derivatives_are_those_of_the_formula_of_the_root():
         assert np.asarray(found) == pytest.approx(np.asarray(known), abs=1e-12)
 
 
+@pytest.mark.soak
 def test_engines_agree_on_a_batch_with_parameters_of_its_own():
     momenta, scales = np.outer([1.0, 0.9, 0.5], MOMENTUM), np.array([1.3, 1.5, 1.1])
     of = lambda system, engine: run(system, SCHEMES["discrete Dirac"], momenta, scales, engine=engine, batch_params=True)
@@ -106,6 +109,7 @@ def test_roots_in_a_loop_stay_inside():
 
 
 @pytest.mark.parametrize("count", [3, 70])
+@pytest.mark.soak
 def test_roots_side_by_side_and_their_derivatives(count):
     """Those of u + a u³ = b, in the middle of a derivative, for each of the a; asked for twice."""
     root = lambda a, b: nearest_root(lambda u: u + a * u**3 - b, b)
@@ -124,6 +128,7 @@ def test_roots_side_by_side_and_their_derivatives(count):
 
 
 @pytest.mark.parametrize("scheme", [dx.Collocation(2), dx.DiscreteDirac()], ids=["collocation", "discrete Dirac"])
+@pytest.mark.soak
 def test_a_motion_whose_momentum_comes_to_have_no_velocity_ends_there(scheme):
     """The momenta of √(1 + ξ·Iξ) are bounded, gravity drives one out of them, and the root goes to infinity."""
     body = dx.EulerPoincare(dx.SO3(), lambda xi, a: jnp.sqrt(1.0 + xi @ (INERTIA * xi)) - 5.0 * a[2], advected=3)

@@ -106,6 +106,7 @@ def assert_same_bits(a, b, rows_a=slice(None), rows_b=slice(None)) -> None:
 
 
 @pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.soak_of(but=["harmonic oscillator"])
 def test_both_engines_agree_to_roundoff_growth(name):
     p, growth = problem(name), SYSTEMS[name][-1]
     mine, theirs = native.run(p), xla.run(p)
@@ -117,6 +118,7 @@ def test_both_engines_agree_to_roundoff_growth(name):
 
 
 @pytest.mark.parametrize("name", ["planar double pendulum", "rolling disk, midpoint"])
+@pytest.mark.soak_of("rolling disk, midpoint")
 def test_bits_do_not_depend_on_batch_lane_width_threads_or_repetition(name, monkeypatch):
     batch = spread(problem(name, steps=60), 11)
     monkeypatch.setattr(driver, "WORTH_THREADS", 0.0)
@@ -167,6 +169,7 @@ def small(equation, state, h=0.1, steps=20, **more) -> Problem:
     return Problem(equation, state, guess, h, 0.0, steps, batch=len(state) if state.ndim == 2 else None, **more)
 
 
+@pytest.mark.soak
 def test_failing_lanes_stop_at_their_last_good_step_and_the_others_go_on():
     # backward Euler of ẋ = √(1 − x) + drift: NaN beyond 1
     equation = implicit(lambda u, x, t, h, params: u - x - h * (0.2 + jnp.sqrt(1 - u)))
@@ -245,6 +248,7 @@ def test_explicit_methods_time_and_parameters():
     assert native.run(one).fields["x"].tobytes() == outcome.fields["x"][1:2].tobytes()
 
 
+@pytest.mark.soak
 def test_sequences_of_equations_agree_with_xla():
     """Euler forward and backward in turn, and Suzuki's five stages of one equation."""
     force = lambda x, t: jnp.stack([x[1], -jnp.sin(x[0]) + 0.1 * jnp.cos(t)])
@@ -272,6 +276,7 @@ def test_sequences_of_equations_agree_with_xla():
 
 @settings(max_examples=2, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 5))
+@pytest.mark.soak
 def test_random_equations_agree_with_xla(seed, size):
     rng = np.random.default_rng(seed)
     a, b, c = rng.standard_normal((3, size, size)) / np.sqrt(size)
@@ -304,6 +309,7 @@ def test_an_interruption_keeps_what_was_computed(monkeypatch):
     np.testing.assert_array_equal(outcome.closing["q"], outcome.last_state[:, :2])
 
 
+@pytest.mark.soak
 def test_code_of_few_operations_is_quick_from_the_beginning(monkeypatch):
     monkeypatch.setenv("DIRAX_CACHE", "off")
     levels = compiled_levels(monkeypatch)
@@ -400,6 +406,7 @@ def test_the_kernel_of_sizes_is_counted_among_what_is_compiled(monkeypatch):
     assert_same_bits(second, third)
 
 
+@pytest.mark.soak
 def test_a_step_near_the_limit_of_nodes_has_its_sizes_and_derivatives(monkeypatch):
     """The nodes that these need beside the step's own are not counted: whatever is asked of it after the first run is found."""
     system = dx.LagrangeDirac(lambda q, v, params: params * (v @ v) / 2 - params * jnp.sum(jnp.cos(q)) - q[0] * q[1])
@@ -510,6 +517,7 @@ def test_compensated_runs_agree_with_plain_ones_and_do_not_depend_on_the_batch()
 
 
 @pytest.mark.parametrize("engine", [native, xla])
+@pytest.mark.soak_of("engine1")
 def test_every_kind_of_failure_stays_in_its_lane(engine):
     """u₀² = c₀, c₁(u₁ − x₁) = 0: solvable, without a root, with a singular Jacobian, not a number, solvable."""
     equation = implicit(lambda u, x, t, h, c: jnp.stack([u[0] ** 2 - c[0], c[1] * (u[1] - x[1])]), size=2)
@@ -524,6 +532,7 @@ def test_every_kind_of_failure_stays_in_its_lane(engine):
 
 
 @pytest.mark.parametrize("step", [0.2, 1.0])
+@pytest.mark.soak_of("1.0")
 def test_a_first_guess_behind_an_exponential_wall_is_no_solution(step):
     """There Newton's method comes down by a constant a step, for more updates than it has: it fails, and says so."""
     wall = dx.LagrangeDirac(lambda q, v, params: v[0] ** 2 / 2 - jnp.exp(params["a"] * q[0]) / params["a"])
@@ -568,6 +577,7 @@ def test_a_first_guess_between_two_bodies_gives_no_sizes():
     assert solved
 
 
+@pytest.mark.soak
 def test_a_step_that_is_singular_at_its_first_guess_alone_is_taken():
     """The matrix of a long step may be singular where two bodies nearly meet: that says nothing of the Lagrangian."""
     system, potential = bodies(0.0)

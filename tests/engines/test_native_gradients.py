@@ -80,6 +80,7 @@ QUICK = ("batch of parameters",)
 
 
 @pytest.mark.parametrize("name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.soak) for name in RUNS])
+@pytest.mark.soak
 def test_cotangents_of_all_rows_are_the_xla_engines(name):
     """With random weights on every saved number: positions, momenta and multipliers, by initial data, params and step."""
     run, point = RUNS[name]
@@ -122,6 +123,7 @@ def test_second_derivatives():
     ("engine", "holonomic"),
     [("native", False), *(pytest.param(*both, marks=pytest.mark.soak) for both in (("xla", False), ("native", True)))],
 )
+@pytest.mark.soak
 def test_second_derivatives_of_a_nonlinear_run(engine, holonomic):
     """Forward and reverse, and for a batch: beside differences of the first."""
     more = {"holonomic": lambda q: jnp.array([(q @ q - 1) / 2])} if holonomic else {}
@@ -145,6 +147,7 @@ def test_second_derivatives_of_a_nonlinear_run(engine, holonomic):
     [MIDPOINT, dx.Composition(MIDPOINT, "suzuki4"), dx.DiscreteDirac(constraints="resolve"), dx.Collocation(2)],
     ids=["midpoint", "composed", "Method 2", "Gauss"],
 )
+@pytest.mark.soak_of(but=["Method 2"])
 def test_second_derivatives_are_native_in_every_way_and_symmetric(scheme, monkeypatch):
     """Of data, parameters, the step and the time, with forces and explicit time: the run with its tangent is another such run.
     XLA took fifteen seconds for what takes three."""
@@ -240,6 +243,7 @@ RULES = {
 
 
 @pytest.mark.parametrize("name", RULES)
+@pytest.mark.soak_of("stop_gradient", "custom_vjp")
 def test_functions_keep_the_rules_of_their_derivatives(name):
     """A force f(k) for one second: the momentum moves as JAX says that f does; and so inside of a Lagrangian."""
     f, engine = RULES[name]
@@ -255,6 +259,7 @@ def test_functions_keep_the_rules_of_their_derivatives(name):
     np.testing.assert_allclose(slopes[1:], slopes[0], rtol=1e-12)
 
 
+@pytest.mark.soak
 def test_a_trajectory_that_ends_keeps_its_derivative_and_spoils_no_other():
     """L = v²/2 − q + 10⁻⁴√q falls out of its domain; up to there against central differences."""
     falling = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[0] + 1e-4 * jnp.sqrt(q[0]))

@@ -22,6 +22,7 @@ def root(equation, guess, args=(), **keywords):
     return np.asarray(u), int(updates), bool(converged)
 
 
+@pytest.mark.soak
 def test_roots_against_mpmath():
     """x = cos x and y eʸ = x² from far and near: the same digits, to roundoff."""
     x = mpmath.findroot(lambda x: x - mpmath.cos(x), 0.7)
@@ -60,6 +61,7 @@ def test_equations_without_a_root_are_said_not_to_converge(equation, guess):
 
 
 @pytest.mark.parametrize("engine", ["native", "xla"])
+@pytest.mark.soak_of("xla")
 def test_an_iteration_that_comes_from_far_away_is_not_done_yet(engine):
     """A wall of exponentials that is cut off, met at full speed: the first update leads to 1e20, the next back to about zero,
     and the third is small beside it. Whoever takes that for contraction is wrong by 2 %."""
@@ -75,6 +77,7 @@ def test_an_iteration_that_comes_from_far_away_is_not_done_yet(engine):
 
 
 @pytest.mark.parametrize("engine", ["native", "xla"])
+@pytest.mark.soak_of("xla")
 def test_a_linearization_that_leads_nowhere_says_nothing_about_sizes(engine):
     """From rest, by a force that is constant at the guess and 1e22 times weaker where that leads: Newton goes to and fro."""
     force = lambda t, q, v: -1e3 * (jnp.exp(jnp.clip((v + 1.0) / 0.02, -100.0, 50.0)) - 1.0)
@@ -94,6 +97,7 @@ def test_where_it_does_not_run_the_guess_comes_back():
     assert u[0] == 5.0 and updates == 0
 
 
+@pytest.mark.soak
 def test_lanes_of_a_batch_do_not_depend_on_each_other():
     """Each lane has the bits and the number of updates that it has among others that need more."""
     one = lambda guess: newton_root(lambda u: u - jnp.cos(u) * u, guess, (), 50)[:2]
@@ -137,6 +141,7 @@ SOLVED = jax.jit(lambda a, b: Dense().solve(Dense().factorise(a), b))
 
 
 @given(st.sampled_from([1, 2, 3, 5, 9]), st.integers(0, 2**32 - 1))
+@pytest.mark.soak
 def test_linear_solves_with_zero_pivots(k, seed):
     """Backward error at roundoff for all three ways, for saddle-point matrices, whose corner is zero."""
     rng = np.random.default_rng(seed)
@@ -179,6 +184,7 @@ class Richardson(dx.AbstractLinearSolver):
 
 
 @pytest.mark.parametrize("solver", [QR(), pytest.param(Richardson(), marks=pytest.mark.soak)])
+@pytest.mark.soak
 def test_a_linear_solver_is_one_class(solver):
     """Values and derivatives of a run of five coupled pendulums, against the native engine."""
     system = dx.LagrangeDirac(lambda q, v, k: v @ v / 2 + jnp.sum(jnp.cos(q)) - k * jnp.sum(jnp.diff(q) ** 2) / 2)

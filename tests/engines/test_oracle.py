@@ -61,6 +61,7 @@ QUICK = ("kepler", "rolling-disk", "henon-heiles", "lc-ladder", "rigid-body")
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[] if n in QUICK else pytest.mark.soak) for n in gallery.names()])
+@pytest.mark.soak
 def test_the_gallery_by_jax_alone(name):
     example = gallery.get(name)
     ours, theirs = (example.simulate(steps=5, engine=engine) for engine in (ORACLE, "native"))

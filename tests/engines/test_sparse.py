@@ -58,6 +58,7 @@ RUNS = {
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.soak] if n == "links, Method 1" else []) for n in RUNS])
+@pytest.mark.soak_of(but=["two points"])
 def test_equals_the_dense_engine(name):
     system, scheme, initial = RUNS[name]
     step = 1e-3 if system is LINKS else 0.05
@@ -153,6 +154,7 @@ def test_a_batch_keeps_its_bits():
 
 
 @pytest.mark.parametrize("system", [STIFF, pytest.param(LINKS, marks=pytest.mark.soak)], ids=["chain", "links"])
+@pytest.mark.soak
 def test_derivatives_are_those_of_the_dense_engine(system):
     start = WAVE if system is STIFF else STRAIGHT
 
@@ -182,6 +184,7 @@ def test_a_thousand_links_start_and_conserve_their_energy():
     assert np.ptp(sol.energy()) < 1e-9
 
 
+@pytest.mark.soak
 def test_links_in_other_units():
     """A bent chain of nanometres was refused as singular, and one of small masses was off by 4e-10 after twice the updates."""
     count = 30
@@ -233,6 +236,7 @@ def test_singular_first_steps_are_named():
 
 
 @pytest.mark.parametrize("wrong", ["residual", "Jacobian"])
+@pytest.mark.soak_of("residual")
 def test_wrong_sites_are_refused(monkeypatch, wrong):
     from dirax.engines.sparse import by_sites, plan
     from dirax.program.sites.jacobian import entries_of_jacobian
@@ -289,6 +293,7 @@ def test_it_says_why_it_does_not_take_a_step():
     assert isinstance(Auto()._by_arrays(dataclasses.replace(problem))[1]["not_sparse"], str)
 
 
+@pytest.mark.soak
 def test_indices_that_depend_on_values_are_left_to_dense_steps():
     """Each site is drawn to one that its own place chooses: which, no pattern says."""
 
@@ -325,6 +330,7 @@ def test_machines_of_many_bodies_are_run_by_the_levels_of_their_program(monkeypa
     np.testing.assert_allclose(matrix.toarray(), slopes[0], rtol=1e-11, atol=1e-11)
 
 
+@pytest.mark.soak
 def test_levels_of_a_program_with_choices():
     from dirax.program.evaluation.in_levels import in_levels
     from dirax.program.graph import Graph

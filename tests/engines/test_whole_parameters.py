@@ -44,6 +44,7 @@ def test_indices_and_truth_values(engine):
     ],
 )
 @pytest.mark.parametrize("engine", ["xla", "native"])
+@pytest.mark.soak_of("xla-number0-<lambda>", "xla-number1-<lambda>", "xla-9007199254740993-<lambda>", "xla-1000000000-<lambda>")
 def test_whole_numbers_of_any_size_are_those_of_jax(number, stiffness, engine):
     run = {"q": np.ones(1), "v": np.zeros(1), "step": 0.1, "steps": 30, "engine": engine}
     sol = dx.simulate(oscillator(stiffness), MIDPOINT, params=number, **run)
@@ -66,6 +67,7 @@ def test_floats_of_other_kinds(kind):
 
 
 @pytest.mark.parametrize("engine", ["xla", "auto"])
+@pytest.mark.soak_of("xla")
 def test_a_table_read_where_the_params_are_captured(engine):
     """sol.params can be closed over and read by an index that JAX traces, as can what a failed step is explained from."""
     chosen = oscillator(lambda p: p["table"][p["k"]])
@@ -118,6 +120,7 @@ def mixed_slope(k):
 
 
 @pytest.mark.parametrize("engine", ["xla", "auto", "native"])
+@pytest.mark.soak
 def test_leaves_that_stand_still_beside_one_that_jax_traces(engine):
     end = lambda k: mixed(engine, k=k)
     several = jnp.array([1.5, 0.5])
@@ -141,6 +144,7 @@ def test_leaves_that_are_no_floats_and_that_jax_traces(engine):
     np.testing.assert_allclose(slopes["k"][0], mixed_slope(1.5), rtol=1e-6)
 
 
+@pytest.mark.soak
 def test_what_only_whole_numbers_can_do_falls_back_and_says_so():
     shifted = oscillator(lambda p: (1 << p["k"]).astype(float))
     k = np.array([0, 1, 3])

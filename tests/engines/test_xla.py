@@ -42,12 +42,14 @@ def cayley(q, v, omega, h, t):
 # -------------------------------------------------------------------------------------------------- closed forms, gradients
 
 
+@pytest.mark.soak
 def test_the_midpoint_oscillator_is_a_cayley_map():
     sol = dx.simulate(OSCILLATOR, MIDPOINT, q=[1.0], v=[0.4], params=1.7, step=0.1, steps=5000, engine="xla")
     np.testing.assert_allclose(sol.q[:, 0], cayley(1.0, 0.4, 1.7, 0.1, sol.t), atol=1e-12)
 
 
 @pytest.mark.parametrize("save_every", [pytest.param(1, marks=pytest.mark.soak), 7])
+@pytest.mark.soak
 def test_gradients_of_the_oscillator_against_the_closed_form(save_every):
     """With respect to initial data, params and the step itself, of every saved row at once, in reverse mode."""
     steps, weights = 40, np.random.default_rng(0).normal(size=len(range(0, 40, save_every)) + 1)
@@ -70,6 +72,7 @@ def test_gradients_of_the_oscillator_against_the_closed_form(save_every):
     np.testing.assert_allclose(jax.jit(jax.grad(loss, argnums=(0, 1, 2, 3)))(q, v, omega, h), expected, rtol=1e-10)
 
 
+@pytest.mark.soak
 def test_derivatives_of_a_nonlinear_trajectory_against_finite_differences():
     """A sum of the double pendulum's end as a function of (q, v, g): forward mode, reverse mode and central differences."""
 
@@ -110,6 +113,7 @@ def test_saving_less_is_subsampling():
 
 
 @pytest.mark.parametrize("save_every", [1, 3])
+@pytest.mark.soak_of("1")
 def test_chunks_leave_no_trace(monkeypatch, save_every):
     """The bits of a run do not depend on where its chunks end, within rows or between them, nor on how many there are."""
     whole = dx.simulate(PENDULUMS, MIDPOINT, **SWING, steps=200, save_every=save_every)
@@ -160,6 +164,7 @@ def falling_problem(states, steps, **keywords) -> Problem:
     return problem(falling, states, states[..., 1:], 0.01, steps, **keywords)
 
 
+@pytest.mark.soak
 def test_a_batch_is_its_trajectories_and_failures_stay_alone():
     """The others of a batch do not change a bit when one fails, and agree with single runs to roundoff."""
     healthy, failing = [1.0, 40.0], [0.5, -1.0]
@@ -176,6 +181,7 @@ def test_a_batch_is_its_trajectories_and_failures_stay_alone():
     np.testing.assert_allclose(mixed.fields["q"][1, :good], alone.fields["q"][0, :good], atol=1e-13)
 
 
+@pytest.mark.soak
 def test_one_failure_in_a_large_batch_is_seen():
     """XLA's vectorized maximum over the lanes of a large batch loses NaNs: no judgement may rest on it."""
     n, lanes = 5, 1000
@@ -189,6 +195,7 @@ def test_one_failure_in_a_large_batch_is_seen():
     assert np.all(np.isfinite(sol.q[700, :3])) and np.all(sol.q[700, :3] > 0)
 
 
+@pytest.mark.soak
 def test_dead_trajectories_cost_nothing():
     """10¹⁵ steps would take a lifetime: the run ends with the last living trajectory."""
     out = XLA.run(falling_problem([[0.5, -1.0], [0.3, 0.0]], 10**15, save_every=10**14, batch=2))
@@ -217,6 +224,7 @@ def test_an_interrupted_run_keeps_what_was_computed(monkeypatch):
 @pytest.mark.parametrize(
     "state", [[0.5, -1.0], pytest.param([0.00501, -1.0], marks=pytest.mark.soak)], ids=["on the way", "in the first step"]
 )
+@pytest.mark.soak
 def test_a_failure_leaves_the_derivatives_of_the_others(state):
     """With respect to initial data and to a parameter that all share; the good rows of the one that fails keep theirs."""
     falling = dx.LagrangeDirac(lambda q, v, g: v @ v / 2 - g * q[0] + 1e-4 * jnp.sqrt(q[0]))
@@ -256,6 +264,7 @@ def test_the_residual_reported_is_that_of_the_accepted_step():
     assert 0 < sol.stats["max_residual"] < 10 * np.finfo(float).eps * np.max(np.abs(sol.p))
 
 
+@pytest.mark.soak
 def test_a_chain_of_thirty_oscillators():
     """Above the size that is inverted by hand, against the Cayley map of every normal mode."""
     n, h, steps = 30, 0.1, 500
@@ -269,6 +278,7 @@ def test_a_chain_of_thirty_oscillators():
     assert sol.stats["newton_iterations"] <= 2 * steps
 
 
+@pytest.mark.soak
 def test_one_compiled_function_serves_every_run_of_an_equation(compiled):
     """Other initial data, params, step, number of steps, time and rows saved: nothing is compiled again."""
     run = {"q": [1.0], "v": [0.0], "params": 1.0, "step": 0.1, "steps": 30, "engine": "xla"}
@@ -296,6 +306,7 @@ def test_sizes_of_a_step_that_is_too_large_to_be_solved_in_numbers(monkeypatch):
 
 
 @pytest.mark.parametrize("batch", [None, 2])
+@pytest.mark.soak_of("None")
 def test_sizes_of_a_run_that_jax_traces_are_those_of_the_run(batch):
     """One by one and over axes of vmap, of the data, of the step and of a parameter."""
     state, guess = np.array([1.0, 0.5, 0.0, 1e-9]), np.array([1.0, 0.5])

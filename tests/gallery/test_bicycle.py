@@ -26,6 +26,7 @@ def of_lean_and_steer(found):
     return np.delete(values, np.argmin(np.abs(values)))
 
 
+@pytest.mark.soak
 def test_eigenvalues_at_five_metres_a_second():
     found = at_speed(5.0)
     assert of_lean_and_steer(found) == pytest.approx(EIGENVALUES, abs=1e-11)
@@ -149,6 +150,7 @@ def circling(steer, near):
     return *solved.x, abs(v["rear wheel"] * bicycle.REAR)
 
 
+@pytest.mark.soak
 def test_circular_motions_are_relative_equilibria_by_newton_and_euler():
     """Two families (Basu-Mandal et al. 2007): one leaves straight riding at the capsize speed, one lies down as it speeds up."""
     near = 6.0 / (1.02 / np.cos(bicycle.TILT))
@@ -160,6 +162,7 @@ def test_circular_motions_are_relative_equilibria_by_newton_and_euler():
     assert np.abs(newton_euler_defect(named(other["q"]), named(other["v"]))).max() > 1e-3
 
 
+@pytest.mark.soak
 def test_the_discrete_equations_have_these_eigenvalues_to_second_order():
     place, midpoint = bicycle.straight(5.0), dx.LagrangeDAlembert()
     errors = []
@@ -170,6 +173,7 @@ def test_the_discrete_equations_have_these_eigenvalues_to_second_order():
     assert len(found.multipliers) == 5 and np.abs(found.multipliers).max() == pytest.approx(1.0, abs=1e-11)
 
 
+@pytest.mark.soak
 def test_accelerations_of_the_nonlinear_benchmark():
     """Basu-Mandal, Chatterjee, Papadopoulos 2007, Table 1; their bicycle rides along −x, upright at ψ = π/2 and φ = π."""
     theta, psi, phi, steer = 0.0, 0.9501292851472, 3.1257073014894, 0.2311385135743
@@ -186,6 +190,7 @@ def test_accelerations_of_the_nonlinear_benchmark():
 
 
 @pytest.mark.parametrize("manoeuvre", bicycle.MANOEUVRES, ids=lambda example: example.name)
+@pytest.mark.soak_of(but=["bicycle M3"])
 def test_the_manoeuvres_of_the_iftomm_library_are_within_its_score(manoeuvre):
     """M1, M2 and M3: pushed to the side with a rate of roll, 20 s; 100 (E_max − E_min)/E_0 is to be below 1e-3."""
     sol = manoeuvre.simulate()

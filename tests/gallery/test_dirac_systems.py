@@ -47,6 +47,7 @@ def test_quadratic_casimirs_and_integrals_are_kept():
 
 
 @pytest.mark.parametrize("theta, order", [(0.0, 1), (0.25, 1), (0.5, 2), (0.75, 1), (1.0, 1)])
+@pytest.mark.soak_of("1.0-1")
 def test_every_theta_lifts_to_a_symplectic_method(theta, order):
     pendulum = gallery.get("pendulum")
     scheme = dx.DiscreteDirac(map=dx.cotangent_lift(dx.Theta(theta)))
@@ -56,6 +57,7 @@ def test_every_theta_lifts_to_a_symplectic_method(theta, order):
     assert dx.verify(sol)["symplecticity of one step"].value < 1e-12
 
 
+@pytest.mark.soak
 def test_the_rigid_body_by_both_maps_over_a_million_steps_stays_on_the_sphere():
     body = gallery.get("rigid-body")
     for map in (dx.SphereProjection(), dx.RiemannianExp(dx.Sphere(3), 0.5)):

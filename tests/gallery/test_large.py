@@ -31,6 +31,7 @@ def test_toda_keeps_its_eigenvalues_and_is_the_limit_of_small_amplitudes():
         assert np.max(np.abs(near - other)) < most * amplitude * 20
 
 
+@pytest.mark.soak
 def test_ten_thousand_sites_carry_the_kink():
     errors = []
     for sites in (2500, 10_000):
@@ -113,6 +114,7 @@ def test_a_pulse_goes_along_a_line_of_ten_thousand_cells():
     assert errors[-1] < 2e-5 and all(3.8 < a / b < 4.2 for a, b in itertools.pairwise(errors))
 
 
+@pytest.mark.soak
 def test_a_sheet_swings_in_its_modes():
     columns, rows, h, steps = 20, 12, 0.3, 10
     x, frequency = wave_sheet.mode(columns, rows, 1, 2)

@@ -32,6 +32,7 @@ LAGRANGE_TOP = dx.EulerPoincare(SO3, lambda xi, gamma: (xi[0] ** 2 + xi[1] ** 2 
 
 
 @pytest.mark.parametrize("map", MAPS)
+@pytest.mark.soak_of("exp")
 def test_heavy_top_is_of_second_order_and_keeps_its_integrals(map):
     x0 = TOP.initial["x"]
     end = integrate(heavy, [*x0, *np.eye(3).ravel()], 4.0)
@@ -47,6 +48,7 @@ def test_heavy_top_is_of_second_order_and_keeps_its_integrals(map):
     assert np.abs(np.einsum("tij,tj->ti", matrices(SO3, sol.q), gamma) - x0[3:]).max() < 1e-13
 
 
+@pytest.mark.soak
 def test_hamiltonian_and_lagrangian_top_are_one():
     x0 = TOP.initial["x"]
     by_hamiltonian = run(ON_SO3, "cayley", 0.05, 300, x=x0, params=TOP.params)
@@ -67,6 +69,7 @@ def test_hamiltonian_and_lagrangian_top_are_one():
 # --------------------------------------------------------------------------------------------------------------- SE(3)
 
 
+@pytest.mark.soak
 def test_vehicle_is_of_second_order_and_keeps_its_casimirs():
     example = gallery.get("underwater-vehicle")
 
@@ -90,6 +93,7 @@ def test_vehicle_is_of_second_order_and_keeps_its_casimirs():
     assert np.ptp(kept, axis=1).max() < 2e-13
 
 
+@pytest.mark.soak
 def test_a_representation_of_ones_own():
     """A ball on a spring: the body sees the spring's end, a point that rigid motions move, at a = g⁻¹·(r, 1)."""
     ball = dx.EulerPoincare(
@@ -106,6 +110,7 @@ def test_a_representation_of_ones_own():
 
 
 @pytest.mark.parametrize(("name", "map"), [("suslov", "exp"), ("chaplygin-sleigh-se2", "cayley")])
+@pytest.mark.soak_of("suslov-exp")
 def test_constrained_motions_are_their_closed_forms(name, map):
     example, errors = gallery.get(name), []
     for steps in (100, 200, 400):

@@ -27,6 +27,7 @@ from dirax.gallery import (
 )
 
 
+@pytest.mark.soak
 def test_andrews_squeezer_ends_where_the_test_set_says():
     """Symmetric steps, extrapolated twice; the reference of the IVP test set."""
     ends = [andrews_squeezer.EXAMPLE.simulate(step=0.03 / n, steps=n, save_every=n).q[-1] for n in (4000, 8000, 16000)]
@@ -40,6 +41,7 @@ def test_the_car_axis_ends_where_the_test_set_says():
     assert sol.ok and np.abs(sol.q[-1] - car_axis.REFERENCE).max() < 2e-12
 
 
+@pytest.mark.soak
 def test_the_slider_crank_ends_where_the_test_set_says():
     """Symmetric steps, extrapolated once; the elastic coordinates are millionths of a metre."""
     coarse, fine = (slider_crank.EXAMPLE.simulate(step=0.1 / n, steps=n, save_every=n).q[-1] for n in (40_000, 80_000))
@@ -94,6 +96,7 @@ def test_trailers_follow_and_settle_on_their_circles():
 
 
 @pytest.mark.parametrize("ridden", [snakeboard_gait, trikke])
+@pytest.mark.soak_of(but=["dirax.gallery.trikke"])
 def test_gaits_ride_ahead_on_their_skates_alone(ridden):
     """Motors do all the work, skates none: the energy is their work; and no skate slides at the middle of a step."""
     sol = ridden.EXAMPLE.simulate(steps=1000)
@@ -143,6 +146,7 @@ def test_eulers_disk_runs_round_as_moffatt_says():
         dx.linearize(euler_disk.MODEL.system, other, symmetries=euler_disk.SYMMETRIES)
 
 
+@pytest.mark.soak
 def test_the_rattleback_turns_round_one_way_only():
     changes = {}
     for spin in (-5.0, 5.0):
@@ -162,6 +166,7 @@ def test_the_tippe_top_turns_over_and_keeps_jelletts_integral():
     assert np.ptp(seen["jellett"]) < 1e-3 * seen["jellett"][0] and np.all(np.diff(sol.energy()) < 1e-9)
 
 
+@pytest.mark.soak
 def test_the_governor_turns_freely_and_its_damper_takes_energy():
     sol = flyball_governor.EXAMPLE.simulate(steps=1000, save_every=20)
     seen = flyball_governor.MODEL.observables(sol)
@@ -172,6 +177,7 @@ def test_the_governor_turns_freely_and_its_damper_takes_energy():
     assert seen["energy"] - sol.work == pytest.approx(seen["energy"][0], rel=1e-4)
 
 
+@pytest.mark.soak
 def test_the_arm_keeps_its_angular_momentum_about_the_base():
     """Nothing turns its first hinge; and its energy stays, of which the links throw much to and fro."""
     sol = robot_arm.EXAMPLE.simulate(steps=1000, save_every=100)

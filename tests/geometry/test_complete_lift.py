@@ -31,6 +31,7 @@ class Bent(dx.AbstractDiscretizationMap):
 
 @pytest.mark.parametrize("map", [dx.Midpoint(), dx.Theta(0.3), Bent()], ids=["midpoint", "θ", "bent"])
 @pytest.mark.parametrize("alpha", [ALPHA, LINEAR], ids=["bent α", "linear α"])
+@pytest.mark.soak_of("bent \\u03b1-midpoint", "bent \\u03b1-bent")
 def test_the_printed_equations(map, alpha):
     """(16)–(18) index by index: ∂α_k/∂q^l at R¹ and R², twice antisymmetrized, since dq^i ∧ dq^j sees no more."""
     missed = dx.symplectic_equations(map, SYSTEM(alpha).two_form, Q, V)
@@ -73,6 +74,7 @@ def test_the_complete_lift_is_the_derivative_along_flows():
     assert lifted == pytest.approx(float(jax.grad(moving)(0.0)), abs=1e-13)
 
 
+@pytest.mark.soak
 def test_verify_says_where_the_two_form_of_the_final_manifold_is_preserved():
     """By Method 2: constant dα, dα that changes, θ ≠ ½."""
     lotka_volterra = dx.PhaseSpaceLagrangian(

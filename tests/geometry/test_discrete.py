@@ -57,6 +57,7 @@ def element(sign, h, rng, two_form, matrix_of):
 
 @SOME
 @given(SEEDS, SIGNS, STEPS)
+@pytest.mark.soak
 def test_finite_difference_members_are_those_of_the_definition(seed, sign, h):
     rng = np.random.default_rng(seed)
     D = FiniteDifferenceDirac(two_form, one_forms, step=h, sign=sign)
@@ -289,6 +290,7 @@ def test_discretization_map_members_on_a_vector_space(seed, h, theta):
 
 @SOME
 @given(SEEDS)
+@pytest.mark.soak
 def test_the_free_rigid_body_on_the_sphere_is_a_member(seed):
     """[BLM] (4): (ξ1 − ξ0)/h = ((ξ0 + ξ1)/2) × I⁻¹((ξ0 + ξ1)/‖ξ0 + ξ1‖), with the projection map of the sphere."""
     rng, h, inertia = np.random.default_rng(seed), 0.1, np.array([1.0, 2.0, 3.0])
@@ -316,6 +318,7 @@ def test_discretization_map_structures_refuse_other_objects():
 
 
 @pytest.mark.parametrize("rank", [0, 1, 2, "dependent"])
+@pytest.mark.soak_of("1")
 def test_the_slope_of_a_projected_covector(rank):
     """∂(P(q)α)/∂q by the formula of Golub and Pereyra against central differences of P(q)α, by singular values."""
     w = np.random.default_rng(5).normal(size=(2, 4, 4))

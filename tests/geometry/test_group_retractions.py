@@ -31,6 +31,7 @@ def test_retractions_are_those_of_matrices(group):
 
 
 @pytest.mark.parametrize("group", GROUPS)
+@pytest.mark.soak_of("group1", "group3")
 def test_coadjoint_action_and_tangent_of_a_retraction(group):
     basis = basis_of(group)
     size = np.sum(basis**2, axis=(1, 2))
@@ -50,6 +51,7 @@ def test_coadjoint_action_and_tangent_of_a_retraction(group):
 
 
 @pytest.mark.parametrize("group", GROUPS[1:])
+@pytest.mark.soak_of(but=["group0"])
 def test_bivector_is_poisson_and_its_casimirs_are_in_the_kernel(group):
     """Jacobi's identity Λ_il ∂_l Λ_jk + cyclic = 0, exactly linear in x."""
     space = dx.SemidirectProduct(group, advected=2 if group.dimension == 3 and group.translations else 3)

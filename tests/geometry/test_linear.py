@@ -209,6 +209,7 @@ def test_kernel_and_image_round_trips_in_any_basis(image, rng):
 
 @FAST
 @given(images())
+@pytest.mark.soak
 def test_the_pair_of_proposition_2_3_determines_the_structure(image):
     structure = LinearDirac.from_image(*image)
     basis, form = structure.distribution(), structure.two_form()
@@ -224,6 +225,7 @@ def test_the_pair_of_proposition_2_3_determines_the_structure(image):
 
 
 @pytest.mark.parametrize("n", range(2, 13))
+@pytest.mark.soak_of(but=["2", "3"])
 def test_ten_thousand_random_structures(n):
     """D = D^⊥, round trips between all representations and composition to 1e-10; 3 × 304 structures a dimension."""
     rng = np.random.default_rng(n)
@@ -308,6 +310,7 @@ def test_pull_back_and_push_forward_against_null_spaces(shape, near, data):
 
 @FAST
 @given(maps, st.data())
+@pytest.mark.soak
 def test_pull_back_and_push_forward_are_functorial(shape, data):
     n, k, l = shape
     rng = data.draw(generators)
@@ -335,6 +338,7 @@ joints = st.sampled_from([(2, 3, 1), (4, 4, 2), (6, 5, 3), (5, 9, 4), (12, 7, 5)
 
 @FAST
 @given(joints, st.booleans(), st.data())
+@pytest.mark.soak
 def test_composition_is_dirac_and_symmetric(shape, near, data):
     n, m, c = shape
     first = LinearDirac.from_image(*data.draw(images(st.just(n), near=near)))
@@ -360,6 +364,7 @@ def test_composition_is_dirac_and_symmetric(shape, near, data):
 
 @FAST
 @given(images(st.just(4), near=False), images(st.just(5), near=False), images(st.just(3), near=False))
+@pytest.mark.soak
 def test_composition_is_associative(first, second, third):
     D1, D2, D3 = (LinearDirac.from_image(*image) for image in (first, second, third))
     left = D1.compose(D2, [2, 3], [0, 1]).compose(D3, [4], [0])
@@ -523,6 +528,7 @@ def test_unchecked_input_under_tracing_is_told_by_is_dirac():
     assert not broken.is_dirac() and not broken.is_isotropic() and not broken.is_coisotropic()
 
 
+@pytest.mark.soak
 def test_derivatives():
     rng = np.random.default_rng(8)
     factors = random_map(rng, 4, 2, 2), random_map(rng, 2, 3, 2)

@@ -97,6 +97,7 @@ def manifold_laws(name):
 @pytest.mark.parametrize("name", MANIFOLDS)
 @examples
 @given(seed=seeds, exponent=st.floats(-9.0, 1.0))
+@pytest.mark.soak_of(but=["Product"])
 def test_laws(name, seed, exponent):
     manifold = MANIFOLDS[name]
     a, b, c = random_arrays(seed, 3, BATCH, manifold.ambient_dimension)
@@ -148,6 +149,7 @@ def hat(group, xi):
 @pytest.mark.parametrize("name", GROUPS)
 @examples
 @given(seed=seeds, exponent=st.floats(-9.0, 0.3))
+@pytest.mark.soak_of(but=["SO2"])
 def test_group_laws_and_matrix_exponential(name, seed, exponent):
     group = GROUPS[name]
     xi, eta, zeta = 10.0**exponent * random_arrays(seed, 3, BATCH, group.dimension)
@@ -159,6 +161,7 @@ def test_group_laws_and_matrix_exponential(name, seed, exponent):
 
 
 @pytest.mark.parametrize("name", GROUPS)
+@pytest.mark.soak_of("SE3")
 def test_exponential_is_exact_to_second_order_at_the_identity(name):
     # matrix(exp ξ) = 1 + hat ξ + (hat ξ)²/2 + …: values and two derivatives at 0, where the formulas are 0/0.
     group = GROUPS[name]
@@ -271,6 +274,7 @@ def all_finite(tree):
 
 
 @pytest.mark.parametrize("name", ["Torus", "Sphere(3)", "SE2", "SE3"])
+@pytest.mark.soak_of(but=["Torus"])
 def test_derivatives_are_finite_where_points_coincide(name):
     manifold = MANIFOLDS[name]
     x = manifold.nearest(random_arrays(1, manifold.ambient_dimension))
@@ -280,6 +284,7 @@ def test_derivatives_are_finite_where_points_coincide(name):
 
 
 @pytest.mark.parametrize("name", ["Torus", "Sphere(3)", "SE2", "SO3"])
+@pytest.mark.soak_of("SE2", "SO3")
 def test_derivatives_of_distances_are_finite_where_points_coincide(name):
     manifold = MANIFOLDS[name]
     x = manifold.nearest(random_arrays(1, manifold.ambient_dimension))
@@ -291,6 +296,7 @@ def log_and_distance(x, y):
 
 
 @pytest.mark.parametrize("gap", [0.0, 1e-16, 1e-14, 1e-9, 1e-4])
+@pytest.mark.soak_of("0.0")
 def test_sphere_near_the_cut_locus(gap):
     sphere, x = Sphere(3), jnp.array([0.6, 0.0, 0.8])
     y = -(np.cos(gap) * x + np.sin(gap) * jnp.array([0.0, 1.0, 0.0]))
@@ -302,6 +308,7 @@ def test_sphere_near_the_cut_locus(gap):
 
 @pytest.mark.parametrize("name", GROUPS)
 @pytest.mark.parametrize("gap", [0.0, 1e-12, 1e-6])
+@pytest.mark.soak_of("0.0-SE3")
 def test_groups_near_half_a_turn(name, gap):
     group = GROUPS[name]
     xi = jnp.ones(group.dimension)
@@ -329,6 +336,7 @@ def test_derivative_of_the_sphere_logarithm_against_mpmath():
 # ---------------------------------------------------------------------- Newton's method
 
 
+@pytest.mark.soak
 def test_regular_root_and_its_derivatives():
     # z² = c componentwise
     root = lambda c: regular_root(lambda z: z * z - c, jnp.ones_like(c))

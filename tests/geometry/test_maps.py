@@ -94,6 +94,7 @@ def report_of(name):
 @pytest.mark.parametrize("name", MAPS)
 @examples
 @given(seed=seeds, scale=st.floats(1e-8, 0.8))
+@pytest.mark.soak_of(but=["explicit Euler", "theta", "implicit Euler", "midpoint", "torus"])
 def test_defining_properties(name, seed, scale):
     report, off = report_of(name)(*random_arrays(seed, 2, BATCH, MAPS[name][1]), scale)
     assert np.max(report.point_defect) < 1e-14  # (D1)
@@ -138,6 +139,7 @@ def lift_report_of(name):
 )
 @examples
 @given(seed=seeds, scale=st.floats(1e-8, 0.8))
+@pytest.mark.soak_of("SO2", "SO3", "product", "sphere", "sphere projection")
 def test_lifts_are_symplectic_discretization_maps(name, seed, scale):
     defects, slope_defect = lift_report_of(name)(*random_arrays(seed, 2, BATCH, 2 * MAPS[name][1]), scale)
     for law, defect in defects.items():
@@ -146,6 +148,7 @@ def test_lifts_are_symplectic_discretization_maps(name, seed, scale):
 
 
 @pytest.mark.parametrize("name", ["theta", "sphere projection"])
+@pytest.mark.soak_of(but=["theta"])
 def test_the_check_of_maps_takes_lifts(name):
     map, n = MAPS[name]
     lift = cotangent_lift(map)
@@ -217,6 +220,7 @@ def test_sphere_exponential_inverse_is_the_arccos_formula():
 
 
 @pytest.mark.parametrize("theta", [0.0, 0.5, 1.0])
+@pytest.mark.soak_of("0.0")
 def test_lie_group_map_against_matrix_exponentials(theta):
     group, omega = SO3(), np.array([0.4, -1.1, 0.8])
     g = group.group_exp(jnp.array([0.3, 0.2, -0.9]))
@@ -261,6 +265,7 @@ def test_lift_on_the_sphere_pairs_variations():
     assert p1 @ dq1 - p0 @ dq0 == pytest.approx(float(p_dot @ dq + p @ dq_dot), abs=1e-8)
 
 
+@pytest.mark.soak
 def test_lifted_group_map_has_a_discrete_momentum_map():
     # R_d commutes with left translations, so where the spatial momentum R Π of (q, p) is at rest, it is equal at both ends.
     group = SO3()
@@ -299,6 +304,7 @@ def test_explicit_lift_can_be_lifted_again_on_a_vector_space():
 
 
 @pytest.mark.parametrize("name", ["sphere", "SO3", "sphere projection", "projected midpoint"])
+@pytest.mark.soak_of(but=["sphere projection"])
 def test_second_derivatives_of_inverses_are_finite_at_coinciding_points(name):
     map, n = MAPS[name]
     x = map.manifold(n).nearest(random_arrays(12, n))
@@ -317,6 +323,7 @@ def test_inverse_near_antipodes_is_finite():
 
 
 @pytest.mark.parametrize("base", [Sphere(3), Product(SO3(), Torus(1)), Submanifold(to_parabola, 3)], ids=repr)
+@pytest.mark.soak_of(but=["Sphere(dimension=2, ambient_dimension=3)"])
 def test_cotangent_bundle(base):
     bundle = CotangentBundle(base)
 

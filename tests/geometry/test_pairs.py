@@ -69,6 +69,7 @@ def test_the_flow(sign, scheme):
     np.testing.assert_allclose(sol.q[2], q2, atol=1e-13)
 
 
+@pytest.mark.soak
 def test_the_flow_is_symplectic_without_constraints_and_not_with():
     z = jnp.concatenate([Q0, Q1])
     for pairs, symplectic in ((FREE, True), (dx.DiscreteLagrangianSystem(ld, FORMS), False)):

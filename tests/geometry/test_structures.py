@@ -48,6 +48,7 @@ REPRESENTATIONS = {
 
 
 @pytest.mark.parametrize("name", REPRESENTATIONS)
+@pytest.mark.soak_of("two_form", "subspace", "annihilator")
 def test_at_a_point(name):
     functions = REPRESENTATIONS[name]
     structure = getattr(DiracStructure, f"from_{name}")(*functions)
@@ -178,6 +179,7 @@ INTEGRABLE = {
 
 
 @pytest.mark.parametrize("name", INTEGRABLE)
+@pytest.mark.soak
 def test_integrable_structures_have_no_defect(name):
     structure, n = INTEGRABLE[name]
 
@@ -189,6 +191,7 @@ def test_integrable_structures_have_no_defect(name):
     check()
 
 
+@pytest.mark.soak
 def test_defects_in_closed_form():
     points = np.random.default_rng(4).normal(size=(20, 3))
     x, y, _ = points.T
@@ -207,6 +210,7 @@ def test_defects_in_closed_form():
     assert np.allclose(defects(heisenberg), 2 * np.sqrt(6) / (1 + x**2 + y**2), rtol=1e-12)
 
 
+@pytest.mark.soak
 def test_rolling_disk_is_not_integrable():
     # X = (cos φ, sin φ, 1, 0)/√2 and Y = ∂_φ are orthonormal; |[X, Y]| = 1/√2 and it is orthogonal to Δ.
     on_q = DiracStructure.from_annihilator(rolling)
@@ -269,6 +273,7 @@ def test_cotangent_lift_of_a_change_of_coordinates_is_symplectic():
     assert general.integrability_defect(POINT) < 1e-12
 
 
+@pytest.mark.soak
 def test_pull_back_of_constraints_and_of_integrability():
     def immersion(y):
         return jnp.array([y[0] + y[1] * y[2], y[1], jnp.sin(y[2]), y[0] * y[2]])

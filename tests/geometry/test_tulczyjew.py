@@ -116,6 +116,7 @@ def test_kappa_and_flat_carry_the_symplectic_form_of_tulczyjew(seed):
 
 @FEW
 @given(SEEDS)
+@pytest.mark.soak
 def test_the_dirac_differential_states_the_euler_lagrange_equations(seed):
     """(q̇, ṗ; d_D L) ∈ graph Ω♭ iff p = ∂L/∂v, ṗ = ∂L/∂q, q̇ = v: both sides of the diagram over T(T*Q)."""
     triple, (q, v) = TulczyjewTriple(), points(seed, 2)
@@ -167,6 +168,7 @@ def test_kappa_d_carries_the_difference_of_the_symplectic_forms(seed):
 
 @FEW
 @given(SEEDS)
+@pytest.mark.soak
 def test_the_graph_of_the_flow_of_a_discrete_lagrangian_is_the_image_of_its_differential(seed):
     """κ^d ∘ ι = dL_d ([PY] Definition 6.1), ι(q0, q1) = (F⁻L_d, F⁺L_d)."""
     q0, q1 = points(seed, 2)
@@ -233,6 +235,7 @@ def constrained(request):
 
 
 @pytest.mark.parametrize("sign", ["+", "-"])
+@pytest.mark.soak_of("-")
 def test_without_constraints_flows_are_the_discrete_hamiltonian_map(sign):
     """[PY] (42): φ = F⁺L_d ∘ (F⁻L_d)⁻¹, so it takes F⁻L_d(q0, q1) to F⁺L_d(q0, q1); and it is symplectic.
 
@@ -255,6 +258,7 @@ def test_without_constraints_flows_are_the_discrete_hamiltonian_map(sign):
     np.testing.assert_allclose(jacobian.T @ canonical(3) @ jacobian, canonical(3), atol=1e-11)
 
 
+@pytest.mark.soak_of("+")
 def test_a_path_of_the_constrained_flow_is_in_the_discrete_dirac_structure(constrained):
     """[PY] Definition 6.7, Theorem 6.8: (X^{d±}, d_D^±L_d) ∈ D^{d±}, with the Legendre momenta of the same sign."""
     sign = constrained.structure.sign
@@ -284,6 +288,7 @@ def test_a_path_of_the_constrained_flow_is_in_the_discrete_dirac_structure(const
     agree(back, path[2], 1e-10)
 
 
+@pytest.mark.soak
 def test_the_minus_flow_is_the_plus_flow_backwards():
     """Reversing time, L_d(a, b) → L_d(b, a), exchanges (+) and (−), flow and inverse flow, p and −p."""
     reverse = lambda a, b: discrete_lagrangian(b, a)

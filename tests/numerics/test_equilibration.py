@@ -14,6 +14,7 @@ TRIANGULAR = np.array([[1.0, 3e-13, 0.0], [0.0, 0.7, 5.0], [0.0, 4.0, -0.3]])
 
 @pytest.mark.parametrize("matrix", [COUPLED, SADDLE, TRIANGULAR])
 @pytest.mark.parametrize("xp", [np, jnp])
+@pytest.mark.soak_of("jax.numpy-matrix1")
 def test_scaled_matrices_in_other_units(matrix, xp):
     """A weak entry, that alone connects two parts of a matrix, says how their units are to each other."""
     find = lambda matrix: geometric_scales(matrix, xp)
@@ -38,6 +39,7 @@ def test_an_inverse_keeps_its_small_entries_in_other_units():
         assert condition_number(COUPLED * units * units[:, None]) == condition_number(COUPLED)
 
 
+@pytest.mark.soak
 def test_the_condition_of_singular_matrices_is_infinite():
     """Without a warning, which is an error here."""
     matrices = np.array([np.eye(2), [[1.0, 1.0], [1.0, -1.0]], [[1.0, 0.0], [2.0**-90, 0.0]], np.zeros((2, 2))])
@@ -46,6 +48,7 @@ def test_the_condition_of_singular_matrices_is_infinite():
 
 
 @pytest.mark.parametrize("xp", [np, jnp])
+@pytest.mark.soak_of("jax.numpy")
 def test_entries_near_the_smallest_floats_have_scales(xp):
     """A step at the end of a trajectory that comes to rest: its scales were no floats, and nothing could be said of the step."""
     matrix = xp.asarray([[0.0, -9.5e-306], [9.5e-306, -3.9e-263]])

@@ -195,6 +195,7 @@ def test_what_is_the_same_value_is_no_change(monkeypatch):
 
 
 @pytest.mark.parametrize("kind", [dx.Event, dx.Impact])
+@pytest.mark.soak_of("Impact")
 def test_events_and_walls_are_looked_at_too(kind):
     level, ball = {"w": 0.8}, dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[0])
     height = lambda q: q[0] - level["w"]

@@ -21,6 +21,7 @@ CASES = [
 
 
 @pytest.mark.parametrize("case", CASES)
+@pytest.mark.soak_of("case5")
 def test_values_and_derivatives(case):
     two = len(case["window_strides"]) == 2
     channels = 4 if "feature_group_count" in case else 2

@@ -138,6 +138,7 @@ def test_an_operand_that_is_itself_an_expression_is_not_looked_into():
 
 
 @pytest.mark.parametrize("name", ["functions", "a rule of its own", "branches"])
+@pytest.mark.soak
 def test_the_primitive_is_differentiated_and_vectorized_by_jax(name):
     """What JAX traces has one equation a derivative, which is jax.grad to every transformation."""
     f = SCALARS[name]
@@ -153,6 +154,7 @@ def test_the_primitive_is_differentiated_and_vectorized_by_jax(name):
 
 
 @pytest.mark.parametrize("name", VECTORS)
+@pytest.mark.soak
 def test_a_direction_is_differentiated_and_vectorized_by_jax(name):
     f, v = VECTORS[name], np.array([1.0, -2.0, 0.5])
     ours = lambda q, v: along(f, (q,), (v,))
@@ -277,6 +279,7 @@ def test_the_norm_has_no_derivative_at_zero():
 
 
 @pytest.mark.parametrize("engine", ["native", "xla"])
+@pytest.mark.soak_of("xla")
 def test_a_hertz_contact_flies_freely(engine):
     """V = 200 max(x − ½, 0)^2.5: no force acts where the contact is open."""
     potential = lambda x: 200.0 * jnp.maximum(x - 0.5, 0.0) ** 2.5
@@ -285,6 +288,7 @@ def test_a_hertz_contact_flies_freely(engine):
     assert solution.ok and solution.q[:, 0] == pytest.approx(solution.t, abs=1e-15)
 
 
+@pytest.mark.soak
 def test_a_loop_of_unknown_length_is_differentiated_forwards():
     def potential(q):
         until = lambda s: s[0] < 3.0 + jnp.abs(q[0])

@@ -33,6 +33,7 @@ def split_in_a_loop(q):
         lambda q: q[0] ** 2 * (jnp.uint64(2**63 + 12345) >> 60).astype(float) / 16,
     ],
 )
+@pytest.mark.soak_of(but=["<lambda>1", "split_in_a_loop"])
 def test_both_engines_take_them(potential):
     system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q / 2 - potential(q))
     run = dict(q=[1.0], v=[0.2], step=0.1, steps=20)
@@ -99,6 +100,7 @@ def test_operations_on_arrays_of_constants_have_the_bits_of_those_on_each(monkey
         (lambda q: jnp.abs(q[0] + 1j * q[1] + 0.5) ** 2 / 2, lambda q: ((q[0] + 0.5) ** 2 + q[1] ** 2) / 2),
     ],
 )
+@pytest.mark.soak_of(but=["<lambda>-<lambda>2"])
 def test_complex_numbers_on_the_way(potential, real):
     """i times what no node holds was taken for i: the first of these was a constant potential on the native engine."""
 

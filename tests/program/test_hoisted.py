@@ -70,6 +70,7 @@ WAYS = {
 
 
 @pytest.mark.parametrize("way", WAYS)
+@pytest.mark.soak_of(but=["a partial function", "an object in the closure"])
 def test_it_is_the_run_with_params_and_is_compiled_once(way, compiled):
     loss = lambda k: end(WAYS[way](k))
     assert float(jax.grad(loss)(K)) == float(jax.grad(by_params)(K))
@@ -125,6 +126,7 @@ def test_an_object_that_keeps_a_record_is_left_to_itself():
     assert seen[0].calls > 0
 
 
+@pytest.mark.soak
 def test_beside_params_of_a_batch():
     stiffness = jnp.array([1.0, 2.0])
     batch = {"q": np.ones((2, 2)), "v": np.zeros((2, 2)), "batch_params": True}
@@ -145,11 +147,13 @@ def test_what_follows_a_run_has_the_params_it_was_given():
     assert float(jax.grad(loss)(K)) == pytest.approx(float(near), rel=1e-8)
 
 
+@pytest.mark.soak
 def test_second_derivatives():
     loss = lambda k: end(WAYS["a number"](k))
     assert float(jax.hessian(loss)(K)) == pytest.approx(float(jax.hessian(by_params)(K)), rel=1e-12)
 
 
+@pytest.mark.soak
 def test_walls_and_events_are_those_of_plain_runs():
     """A peg of a thousandth of a step is hit, as it is in a run that nothing traces."""
     fall = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[1])
@@ -179,6 +183,7 @@ OTHERS = {
 
 
 @pytest.mark.parametrize("name", OTHERS)
+@pytest.mark.soak
 def test_of_other_systems(name):
     def loss(k):
         system, scheme, more = OTHERS[name](k)
@@ -201,6 +206,7 @@ def skate(q):
     ],
     ids=["nonholonomic", "on a manifold", "holonomic"],
 )  # fmt: skip
+@pytest.mark.soak_of(but=["on a manifold"])
 def test_of_systems_that_are_made_into_others(system):
     def loss(k):
         return dx.simulate(system(k), MIDPOINT, q=[1.0, 0.0, 0.0], v=[0.0, 0.0, 0.3], step=0.05, steps=20).q[-1, 2]

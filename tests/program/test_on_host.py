@@ -37,6 +37,7 @@ def close(ours, theirs, digits=12):
     jax.tree.map(lambda u, v: np.testing.assert_allclose(u, v, rtol=10.0**-digits, atol=10.0**-digits), ours, theirs)
 
 
+@pytest.mark.soak
 def test_values_and_first_derivatives_of_several_entries():
     along = jnp.array([[0.2, 0.5], [-0.1, 0.3]]), jnp.array([[0.4], [0.0]])
     ours, theirs = (jax.jit(lambda x, a, f=f: jax.jvp(f, (x, a), along))(X, A) for f in (host, by_jax))
@@ -76,6 +77,7 @@ def test_whole_numbers_stand_still(whole):
     close(jax.grad(ours)(X), 2 * whole * X)
 
 
+@pytest.mark.soak
 def test_cotangents_have_the_dtypes_of_what_they_are_of():
     """Of operands of single precision beside those of double precision, of several entries, also of the tangents."""
     wide = lambda x, a: {"both": jnp.sin(x) * a.astype(float)[0], "one": a.astype(float) ** 2}

@@ -53,6 +53,7 @@ FUNCTIONS = {
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
+@pytest.mark.soak_of("cholesky", "pad", "activations", "special")
 def test_options_are_heard(name):
     function = FUNCTIONS[name]
     slope = lambda x: jax.jacfwd(lambda x: jnp.ravel(function(x)))(x)

@@ -209,6 +209,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("name", CASES)
+@pytest.mark.soak_of("elementary")
 def test_compiled_functions_do_what_jax_does(name):
     function, *shapes = CASES[name]
     g, inputs, outputs = traced(function, *shapes)
@@ -264,6 +265,7 @@ DIFFERENTIABLE = ("arithmetic", "powers", "elementary", "inverse", "error functi
 
 
 @pytest.mark.parametrize("name", DIFFERENTIABLE)
+@pytest.mark.soak_of("arithmetic", "products", "hessian", "determinant")
 def test_jacobians_of_the_graph_are_jaxs(name):
     function, *shapes = CASES[name]
     g, inputs, outputs = traced(function, *shapes)
@@ -372,6 +374,7 @@ def fuzz(seed: int, graphs: int, together: int = 100) -> int:
     return compared
 
 
+@pytest.mark.soak
 def test_random_graphs_against_numpy():
     assert fuzz(1, 400, 50) > 400
 
@@ -391,6 +394,7 @@ def switched(q):
 
 
 @pytest.mark.parametrize("potential", [interpolated, switched])
+@pytest.mark.soak_of("interpolated")
 def test_tables_and_switches_are_native(potential):
     system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - potential(q))
     end = lambda q, engine: dx.simulate(system, dx.LagrangeDAlembert(), q=q, v=[0.3], step=0.02, steps=200, engine=engine).q[

@@ -10,6 +10,7 @@ import dirax as dx
 from dirax.program.rounding import rounding
 
 
+@pytest.mark.soak
 def test_xla_is_given_no_large_graph():
     """Of some ten thousand operations, which it would compile for minutes, the terms are found from derivatives."""
     x = jnp.linspace(0.1, 1.0, 48)
@@ -25,6 +26,7 @@ def rounds(count):
     return lambda c: lax.fori_loop(0, count, lambda _, y: y - (y + y**3 - c) / (1 + 3 * y**2), c)
 
 
+@pytest.mark.soak
 def test_an_iteration_that_contracts_is_no_sum_of_its_rounds():
     c = jnp.array([0.3, -2.0, 50.0])
     few, many = (jax.vmap(lambda c, count=count: rounding(rounds(count), c))(c) for count in (8, 80))
@@ -32,6 +34,7 @@ def test_an_iteration_that_contracts_is_no_sum_of_its_rounds():
     assert np.all(few > jnp.abs(rounds(8)(c)))
 
 
+@pytest.mark.soak
 def test_long_sums_keep_their_terms():
     x = jnp.linspace(1.0, 2.0, 80)
     summed = lambda x: lax.fori_loop(0, 80, lambda i, s: s + x[i], 0.0)
@@ -39,6 +42,7 @@ def test_long_sums_keep_their_terms():
 
 
 @pytest.mark.parametrize("engine", ["native", "xla"])
+@pytest.mark.soak_of("xla")
 def test_roots_inside_of_a_lagrangian_leave_steps_their_digits(engine):
     system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - rounds(40)(q[0]) ** 2)
     sol = dx.simulate(system, dx.LagrangeDAlembert(), q=[0.5], v=[0.3], step=0.1, steps=20, engine=engine)

@@ -32,6 +32,7 @@ def test_what_is_shared_out_to_threads_is_counted(function, least, monkeypatch):
 
 
 @pytest.mark.parametrize("threads", [1, 1000])
+@pytest.mark.soak_of("1")
 def test_it_is_vmap(threads, monkeypatch):
     monkeypatch.setattr(module, "threads", lambda: threads)
     draw = np.random.default_rng(0).normal

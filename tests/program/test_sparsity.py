@@ -53,6 +53,7 @@ LARGER = {"small solves"}
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
+@pytest.mark.soak_of(but=["roll", "vmap", "einsum", "mask", "constant matrix", "axes that are repeated"])
 def test_has_the_entries_of_the_jacobian(name):
     function, rng = FUNCTIONS[name], np.random.default_rng(0)
     pattern = pattern_of(function, jax.ShapeDtypeStruct((N,), float)).toarray()
@@ -62,6 +63,7 @@ def test_has_the_entries_of_the_jacobian(name):
         assert np.array_equal(entries, pattern)
 
 
+@pytest.mark.soak
 def test_steps_are_read_through_the_primitives_of_dirax():
     system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - padded(q), holonomic=lambda q: links(q)[::4])
     equation: dx.StepEquation = make_step_equation(dx.LagrangeDAlembert(), system, Shape(N, 0, 2))
@@ -81,6 +83,7 @@ def test_whole_numbers_among_the_parameters_are_looked_at():
         pattern_of(function, unknowns, jax.ShapeDtypeStruct((2,), int))
 
 
+@pytest.mark.soak
 def test_what_depends_on_everything_is_dense():
     size = 4000
     with pytest.raises(Dense, match="too many"):

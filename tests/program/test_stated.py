@@ -42,6 +42,7 @@ def test_a_system_that_is_stated_anew_is_prepared():
 
 
 @pytest.mark.parametrize("kind", [dx.Event, dx.Impact, None])
+@pytest.mark.soak_of(but=["None"])
 def test_a_loss_that_states_everything_compiles_once(kind, compiled):
     def loss(k, offset):
         system = dx.LagrangeDirac(lambda q, v, params: v @ v / 2 - params * q @ q / 2)
@@ -57,6 +58,7 @@ def test_a_loss_that_states_everything_compiles_once(kind, compiled):
     assert loss(1.6, 0.5) != loss(1.6, 0.4) or kind is not dx.Impact
 
 
+@pytest.mark.soak
 def test_what_is_assigned_later_in_another_place_does_not_matter():
     """The function that stands for both holds the values of its closure."""
 
@@ -78,6 +80,7 @@ def test_what_is_assigned_later_in_another_place_does_not_matter():
     assert not np.allclose(end(spring(1.0, pull)), before)
 
 
+@pytest.mark.soak
 def test_values_that_are_traced_are_those_of_their_own_call():
     loss = lambda k: jnp.sum(end(spring(k)))
     for k in (1.0, 2.0):

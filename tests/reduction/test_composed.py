@@ -97,16 +97,19 @@ def agree(whole, again, tolerance):
 
 
 @pytest.mark.parametrize("scheme", SCHEMES.values(), ids=SCHEMES.keys())
+@pytest.mark.soak
 def test_composed_reduced_runs_are_the_unreduced_ones(scheme):
     agree(*both(PLAIN, scheme, TILTED, Q, V, as_whole=True), tolerance=3e-14)
 
 
 @pytest.mark.parametrize("name", ["midpoint", "(-)", "of functions"])
+@pytest.mark.soak_of(but=["(-)"])
 def test_and_by_a_connection_that_is_not_linear(name):
     agree(*both(PLAIN, SCHEMES[name], BENT, Q, V), tolerance=3e-14)
 
 
 @pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.soak_of(but=["redundant"])
 def test_forces_time_affine_and_redundant_constraints(name):
     system, v = SYSTEMS[name]
     for scheme in (MIDPOINT, SCHEMES["(+)"])[: 1 + (name == "forces, affine and time")]:
@@ -114,6 +117,7 @@ def test_forces_time_affine_and_redundant_constraints(name):
 
 
 @pytest.mark.parametrize("scheme", [MIDPOINT, SCHEMES["(-)"], dx.Adjoint(dx.PlusLagrangeDirac())])
+@pytest.mark.soak
 def test_moving_holonomic_constraints(scheme):
     q = np.array([0.6, 0.8, 0.2])
     v = np.array([0.8, -0.6, 0.0]) + 0.05 * np.array([0.6, 0.8, 0.0])
@@ -163,6 +167,7 @@ def exact():
 
 
 @pytest.mark.parametrize(("scheme", "order"), [(MIDPOINT, 4), (SCHEMES["(+)"], 2)], ids=["midpoint", "(+)"])
+@pytest.mark.soak_of("midpoint")
 def test_reduced_momenta_have_the_order_of_the_composition(scheme, order):
     q, p = exact()
     missed = []
@@ -173,6 +178,7 @@ def test_reduced_momenta_have_the_order_of_the_composition(scheme, order):
     assert np.all(np.abs(slopes - order) < 0.25), slopes
 
 
+@pytest.mark.soak
 def test_one_forms_that_the_group_moves_do_not_compose_on_the_quotient():
     moved = dx.LagrangeDirac(lagrangian, lambda q: (1 + q[2] ** 2) * rows(q))
     with pytest.raises(ValueError, match=r"one-form 0 is moved by the group.*step the unreduced system"):
@@ -212,6 +218,7 @@ def velocity_on_bundle():
     return np.concatenate([shape, SO3.left_translate(jnp.asarray(AT[3:]), jnp.asarray(spin))])
 
 
+@pytest.mark.soak
 def test_on_a_bundle_over_the_sphere():
     system = dx.ManifoldLagrangian(on_bundle, BUNDLE, left_invariant_row)
     agree(*both(system, SCHEMES["(-)"], CURVED, AT, velocity_on_bundle(), steps=6), tolerance=1e-12)

@@ -32,6 +32,7 @@ def compared(system, scheme, fibre, twisted: bool, **settings):
 @pytest.mark.parametrize(
     ("scheme", "twisted"), [(dx.PlusLagrangeDirac(), False), (dx.MinusLagrangeDirac("midpoint"), True), (OUTGOING, True)]
 )
+@pytest.mark.soak_of("scheme0-False")
 def test_rolling_disk_without_its_place(scheme, twisted):
     """x and y of the contact point are cyclic; the rolling force moves their momenta."""
     _, _, quotient = compared(
@@ -41,6 +42,7 @@ def test_rolling_disk_without_its_place(scheme, twisted):
     assert np.abs(quotient.constraint).max() < 1e-12
 
 
+@pytest.mark.soak
 def test_rolling_disk_without_potential_has_its_angle_too():
     free = dict(DISK.params) | {"V": 0.0}
     start = {"q": DISK.initial["q"], "v": DISK.initial["v"], "params": free, "step": 0.01}
@@ -52,12 +54,14 @@ def test_rolling_disk_without_potential_has_its_angle_too():
         dx.simulate(dx.reduce(DISK.system, dx.LinearConnection([0, 3])), dx.LagrangeDAlembert(), steps=2, **start)
 
 
+@pytest.mark.soak
 def test_heisenberg_without_its_height():
     start = {"q": [1.0, 0.0, 0.1], "v": [0.5, 1.0, -1.0], "step": 0.01}
     assert dx.check_invariance(HEISENBERG.system, dx.Translations([2]), q=start["q"])
     compared(HEISENBERG.system, dx.PlusLagrangeDirac(), [2], True, project=True, **start)
 
 
+@pytest.mark.soak
 def test_holonomic_constraint_force_and_time():
     """A cart on a moving belt of springs with a pendulum on a rod: X cyclic, x² + y² = 1, drag, and a driven length of L."""
 
@@ -77,6 +81,7 @@ def test_holonomic_constraint_force_and_time():
 
 
 @pytest.mark.parametrize("rule", ["right", "trapezoidal"])
+@pytest.mark.soak_of("right")
 def test_momentum_changes_by_the_group_part_of_the_force(rule):
     """Drag in space alone leaves the charge; a force along θ adds its impulses, here c·t, to it."""
     push = 0.25
@@ -90,6 +95,7 @@ def test_momentum_changes_by_the_group_part_of_the_force(rule):
         assert quotient.mu[:, 0] - quotient.mu[0, 0] == pytest.approx(along * quotient.t, abs=1e-12)
 
 
+@pytest.mark.soak
 def test_forces_and_constraints_that_break_the_symmetry():
     start = {"q": [0.1, 0.2], "v": [0.3, 0.0], "step": 0.1, "steps": 2}
     free = lambda q, v: v @ v / 2

@@ -34,6 +34,7 @@ def close(left, right):
     return all(np.abs(np.asarray(a) - np.asarray(b)).max() < 1e-12 for a, b in zip(left, right, strict=True))
 
 
+@pytest.mark.soak
 def test_every_step_lies_in_the_plus_structure(rows):
     for k in range(STEPS):
         x, w, mu, g = (rows[name][k] for name in ("x", "w", "mu", "g"))
@@ -44,6 +45,7 @@ def test_every_step_lies_in_the_plus_structure(rows):
         assert not close(PLUS.flat((x, w + 1e-6, *pair[2:])), differential)
 
 
+@pytest.mark.soak_of("MinusLagrangeDirac")
 def test_every_step_lies_in_the_minus_structure(rows):
     for k in range(STEPS):
         x, w, mu, g = (rows[name][k] for name in ("x", "w", "mu", "g"))
@@ -55,6 +57,7 @@ def test_every_step_lies_in_the_minus_structure(rows):
 
 
 @pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.soak
 def test_trajectories_make_the_reduced_action_stationary(rows, sign):
     """(5.8) and (5.10): the derivative in all free variables is 0 on a trajectory, and is not next to it."""
     x, w, mu, g, vertical = (jnp.asarray(rows[name]) for name in ("x", "w", "mu", "g", "vertical"))

@@ -27,6 +27,7 @@ def euler(t, y):
 
 
 @pytest.mark.parametrize("map", MAPS)
+@pytest.mark.soak_of("exp")
 def test_momentum_and_attitude_of_the_free_body_are_of_second_order(map):
     exact = integrate(euler, [*(I * OMEGA), *np.eye(3).ravel()], 4.0)
     momenta, attitudes = [], []
@@ -58,6 +59,7 @@ def test_the_free_body_is_that_of_jacobi():
 
 
 @pytest.mark.parametrize("map", MAPS)
+@pytest.mark.soak
 def test_engines_agree_and_momentum_stays(map):
     x = BODY.state(OMEGA)
     sols = [run(BODY, map, steps=500, x=x, engine=engine) for engine in ("xla", "native")]
@@ -71,6 +73,7 @@ def test_engines_agree_and_momentum_stays(map):
         assert np.ptp(sol.energy()) < 2e-3
 
 
+@pytest.mark.soak
 def test_reduced_is_unreduced():
     """L_d of the exponential is left-invariant on SO(3) × SO(3): its discrete Euler–Lagrange equations, in charts."""
     unreduced = dx.ManifoldLagrangian(lambda q, v: BODY.value(SO3.to_algebra(q, v), jnp.zeros(0)), SO3)
@@ -103,10 +106,12 @@ def bivector_defect(system, map, x, h):
 
 
 @pytest.mark.parametrize("map", MAPS)
+@pytest.mark.soak
 def test_one_step_is_a_poisson_map(map):
     assert bivector_defect(BODY, map, BODY.state(OMEGA), 0.2) < 1e-13
 
 
+@pytest.mark.soak
 def test_general_lagrangian_with_advected_quantities_is_poisson():
     system = system_of("top")
     x = system.state(OMEGA, GROUND)
@@ -119,6 +124,7 @@ def test_general_lagrangian_with_advected_quantities_is_poisson():
 
 
 @pytest.mark.parametrize("case", ["top", "suslov"])
+@pytest.mark.soak
 def test_a_step_back_is_the_way_one_came(case):
     """The step equation at −h, with the unknowns of the two ends exchanged, leads from the end of a step to its start."""
     system, h = system_of(case), 0.2
@@ -182,6 +188,7 @@ def system_of(case):
 @pytest.mark.parametrize(
     "case", [*("vehicle", "suslov"), *(pytest.param(name, marks=pytest.mark.soak) for name in ("planar", "sleigh", "top"))]
 )
+@pytest.mark.soak
 def test_reduced_is_unreduced_on_matrices(case):
     """The discrete Euler–Lagrange and Lagrange–d'Alembert equations of L_d on the group, solved on its matrices."""
     group, l, xi, a, forms = CASES[case]
@@ -245,6 +252,7 @@ def test_what_is_reconstructed_is_verified():
 
 
 @pytest.mark.parametrize("scale", [1e-9, 1.0, 1e9])
+@pytest.mark.soak
 def test_a_momentum_that_no_velocity_has_has_no_energy(scale):
     """l = s √(1 + ξ·Iξ) has −s √(1 − μ·I⁻¹μ/s²) for its energy, and momenta with μ·I⁻¹μ < s² alone."""
     body = dx.EulerPoincare(dx.SO3(), lambda xi: scale * jnp.sqrt(1.0 + xi @ (jnp.array([1.0, 2.0, 3.0]) * xi)))

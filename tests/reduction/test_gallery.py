@@ -130,6 +130,7 @@ LONG = "andrews-squeezer", "n-four-bar"
     "name",
     [slow(name) if name in LONG else name for name in WITHOUT if isinstance(gallery.get(name).system, dx.LagrangeDirac)],
 )
+@pytest.mark.soak_of("four-bar", "bricard")
 def test_systems_without_translations(name):
     example = gallery.get(name)
     assert len(dx.translation_symmetries(example.system, example.initial["q"], params=example.params, radius=0.3)) == 0
@@ -153,6 +154,7 @@ def in_own_coordinates(example, point, start):
 
 
 @pytest.mark.parametrize(("name", "fibre", "rule", "step", "point", "start"), CASES)
+@pytest.mark.soak
 def test_gallery_on_the_quotient(name, fibre, rule, step, point, start):
     """500 steps, for a twisted connection, here and there the zero one, lifted back; and by Routh where nothing moves the
     momentum."""
@@ -183,6 +185,7 @@ def test_gallery_on_the_quotient(name, fibre, rule, step, point, start):
 
 
 @pytest.mark.parametrize("name", [name if name == "suslov" else pytest.param(name, marks=pytest.mark.soak) for name in ON_GROUPS])
+@pytest.mark.soak
 def test_gallery_on_groups(name):
     """The discrete Euler–Lagrange and Lagrange–d'Alembert equations of L_d on the group, solved on its matrices."""
     example, h = gallery.get(name), 0.02

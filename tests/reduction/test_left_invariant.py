@@ -33,6 +33,7 @@ def on_matrices(group):
 
 
 @pytest.mark.parametrize("group", [SO2, SE2, SO3, SE3])
+@pytest.mark.soak_of("group2", "group3")
 def test_inertia_is_that_of_the_matrices(group):
     body = dx.reduce(dx.ManifoldLagrangian(on_matrices(group), group), group)
     assert isinstance(body, dx.EulerPoincare)
@@ -79,6 +80,7 @@ def in_quaternions(inertia, forms):
     )
 
 
+@pytest.mark.soak
 def test_suslov_problem_from_its_attitude():
     """The gallery's equations come out, and the unreduced discrete equations, which are others, tend to the same motion."""
     inertia = np.asarray(suslov.inertia(suslov.PARAMS))
@@ -150,6 +152,7 @@ def test_mistakes(make, kind, message):
 
 
 @pytest.mark.parametrize("unit", [1e-26, 1e20])
+@pytest.mark.soak
 def test_units_hide_no_asymmetry_and_make_none(unit):
     """A heavy body of 1e-26 kg was taken for a free one, and forms and constraints of small units for invariant ones."""
     scaled = lambda function: lambda *values: unit * function(*values)

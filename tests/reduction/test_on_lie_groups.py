@@ -133,6 +133,7 @@ def test_verify_measures_the_poisson_structure_and_spatial_momenta():
     assert verdicts["momentum map gravity"] == "ok" and verdicts["momentum map x"] == "VIOLATED"
 
 
+@pytest.mark.soak
 def test_a_step_that_turns_too_far_ends_the_run_with_a_message():
     top = dx.EulerPoincare(SO3, lambda xi, a: xi @ (jnp.asarray(I) * xi) / 2 - 500.0 * a[2], advected=3)
     sol = dx.simulate(top, dx.DiscreteEulerPoincare(), x=top.state([0, 0.1, 0], [0, 0.1, 0.99]), step=0.1, steps=200)
@@ -141,6 +142,7 @@ def test_a_step_that_turns_too_far_ends_the_run_with_a_message():
 
 @pytest.mark.parametrize("engine", ["native", "xla"])
 @pytest.mark.parametrize("map", ["exp", "cayley"])
+@pytest.mark.soak_of("exp-xla")
 def test_a_body_at_rest_stays_at_rest(map, engine):
     sol = run(BODY, map, x=np.zeros(3), steps=3, engine=engine)
     assert np.all(sol.x == 0) and np.all(sol.g == [1, 0, 0, 0])

@@ -38,6 +38,7 @@ def body():
     return [dx.simulate(system, dx.LagrangeDAlembert(), **run) for system in (BODY, *(dx.reduce(BODY, s) for s in symmetries))]
 
 
+@pytest.mark.soak
 def test_a_body_with_a_point_on_a_sphere(body):
     """Both gauges are the unreduced motion, from the pole through several charts."""
     whole, plain, tilted = body
@@ -68,6 +69,7 @@ def test_the_tilted_momenta_and_vertical_parts_by_hand(body):
         np.testing.assert_allclose(tilted.vertical[k], SO3.group_log(SO3.multiply(SO3.inverse(lift), f)), atol=1e-13)
 
 
+@pytest.mark.soak
 def test_the_order_beside_hamels_equations_in_space(body):
     """(∂L/∂ẋ)˙ = ∂L/∂x + λx with |x| = 1, (∂L/∂ω)˙ = ∂L/∂ω × ω, by SciPy in R³ × R³."""
     slopes, hessians = jax.jit(jax.grad(of_body, (0, 1, 2))), jax.jit(jax.hessian(lambda x, z: of_body(x, z[:3], z[3:]), 1))
@@ -105,6 +107,7 @@ BENT = dx.DiscreteConnection(lambda a, b: b[3:] - a[3:] - (a[2:3] + b[2:3]) * (b
     ],
     ids=["free (+), linear", "constrained (−), bent"],
 )
+@pytest.mark.soak_of("free (+), linear")
 def test_by_a_circle_connections_are_functions_of_points_in_space(system, scheme, connection):
     q, rate = np.append(POLE, 0.4), np.array([1.5, 0.3, 0.0])
     v = np.append(rate, 0.5 if system is FREE else -np.asarray(ROW(q))[:3] @ rate)

@@ -26,6 +26,7 @@ def in_angles(q, v, params):
     return kinetic - params["g"] * (params["m1"] * r1[2] + params["m2"] * r2[2])
 
 
+@pytest.mark.soak
 def test_pendulum_of_the_paper():
     """Its end state, from a Lagrangian written in another way; the same energy from the reduced and the unreduced equations."""
     run = {**PENDULUM.initial, "params": PENDULUM.params, "step": 0.01, "steps": 10_000, "engine": "native"}
@@ -128,6 +129,7 @@ def test_events_are_lifted_with_the_motion():
     np.testing.assert_allclose(events.spatial_momentum, start[events.lane], atol=1e-12)
 
 
+@pytest.mark.soak
 def test_reduction_by_all_coordinates_is_reconstructed_and_verified():
     """The shape space is a point; NumPy could not reshape its rows."""
     free = dx.reduce(dx.LagrangeDirac(lambda q, v: v @ v / 2), dx.LinearConnection([0, 1]))

@@ -115,6 +115,7 @@ def ld(q0, q1):
 
 @pytest.mark.parametrize("connection", [LINEAR, BENT])
 @pytest.mark.parametrize("sign", SIGNS)
+@pytest.mark.soak_of(but=["+-connection0"])
 def test_trajectories_lie_in_the_reduced_structure(connection, sign):
     scheme = (dx.PlusLagrangeDirac if sign == "+" else dx.MinusLagrangeDirac)("midpoint")
     system = dx.reduce(dx.LagrangeDirac(lagrangian), connection)

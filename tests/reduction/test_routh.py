@@ -80,6 +80,7 @@ def test_gradients_are_those_of_the_unreduced_run_and_of_differences():
 
 
 @pytest.mark.parametrize("engine", ["native", "xla"])
+@pytest.mark.soak_of("xla")
 def test_a_batch_is_its_trajectories(engine):
     reduced, scheme = dx.reduce(KEPLER, dx.LinearConnection([1])), DiscreteRouth("midpoint")
     q, v, mu = (

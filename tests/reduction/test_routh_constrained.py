@@ -82,6 +82,7 @@ def compared(system, start, fibre, rule="midpoint", constraint="midpoint", momen
     ("rule", "constraint", "momentum", "twist"),
     [("midpoint", "midpoint", None, None), ("trapezoidal", "right", "outgoing", [[0.3, -0.2, 0.4]])],
 )
+@pytest.mark.soak
 def test_a_skate_with_a_rotor(rule, constraint, momentum, twist):
     unreduced, quotient = compared(SKATE, SKATE_START, [3], rule, constraint, momentum, twist)
     assert quotient.equation.unknowns == 4 and unreduced.equation.unknowns == 5
@@ -89,6 +90,7 @@ def test_a_skate_with_a_rotor(rule, constraint, momentum, twist):
     assert np.ptp(unreduced.p[:, 3]) < 1e-12  # no force moves it there either
 
 
+@pytest.mark.soak
 def test_a_spherical_pendulum_on_a_rod():
     unreduced, quotient = compared(BOWL, BOWL_START, [2], twist=[[0.5, -0.3]])
     assert unreduced.equation.unknowns - quotient.equation.unknowns == 2  # ġ, and that of the projected velocity
@@ -96,6 +98,7 @@ def test_a_spherical_pendulum_on_a_rod():
 
 
 @pytest.mark.parametrize("twist", [pytest.param(None, marks=pytest.mark.soak), [[0.3, -0.2, 0.4]]])
+@pytest.mark.soak
 def test_everything_at_once(twist):
     """Nonholonomic, affine and holonomic constraints, forces, explicit time, and a γ without a closed form."""
     start = {"q": [0.6, 0.2, -0.8, 0.1], "v": [0.3, -0.136, 0.2875, 0.8], "project": True}
@@ -104,6 +107,7 @@ def test_everything_at_once(twist):
     assert np.abs(quotient.multipliers).max(axis=0).min() > 1e-4
 
 
+@pytest.mark.soak
 def test_redundant_constraints_and_two_points():
     twice = dx.LagrangeDirac(skate_lagrangian, lambda q: jnp.concatenate([edge(q), 2 * edge(q)]), forces=drag)
     _, quotient = compared(twice, SKATE_START, [3], steps=50)
@@ -138,6 +142,7 @@ def _parts(q, v):
     return slope, mixed, mass, edge(q), jax.jvp(edge, (q,), (v,))[1] @ v
 
 
+@pytest.mark.soak
 def test_second_order_in_q_p_and_multipliers():
     y = np.concatenate([SKATE_START["q"], SKATE_START["v"]])
     exact = solve_ivp(lambda t, y: field(t, y)[0], (0, 1), y, "DOP853", rtol=1e-12, atol=1e-13).y[:, -1]

@@ -35,6 +35,7 @@ def close(sol, other, tolerance=1e-13):
     "scheme",
     [dx.PlusLagrangeDirac("midpoint"), pytest.param(dx.MinusLagrangeDirac("left"), marks=pytest.mark.soak), dx.DiscreteRouth()],
 )
+@pytest.mark.soak_of("scheme2")
 def test_two_stages_are_the_product_in_either_order(scheme):
     staged = dx.reduce(dx.reduce(SYSTEM, FIRST), SECOND)
     assert staged.connection.fibre == (3, 2)
@@ -102,6 +103,7 @@ def se2_sleigh(q, v):
     return forward**2 / 2 + side**2 + spin**2 / 2 + 0.3 * forward * spin
 
 
+@pytest.mark.soak
 def test_translations_and_then_rotations_are_the_motions():
     holonomic = lambda q: jnp.array([q[:2] @ q[:2] - 1.0])
     system = dx.LagrangeDirac(se2_sleigh, holonomic=holonomic)

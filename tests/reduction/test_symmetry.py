@@ -113,6 +113,7 @@ def test_finite_translations_agree_with_the_derivative():
 
 
 @pytest.mark.parametrize("unit", [1e-15, 1e12])
+@pytest.mark.soak_of(but=["1e-15"])
 def test_one_forms_of_any_units(unit):
     """Of a knife edge that turns with y; moved along y it is another one, in whatever units, and along x the same."""
     rows = lambda q: unit * jnp.stack([jnp.stack([jnp.sin(q[1]), -jnp.cos(q[1]), 0.3 + 0 * q[2]])])
@@ -121,6 +122,7 @@ def test_one_forms_of_any_units(unit):
     assert not check_invariance(system, Translations([1]), q=[0.1, 0.2, 0.3])
 
 
+@pytest.mark.soak
 def test_small_units_hide_no_asymmetry():
     """Masses of 1e-27, as in SI units of atoms."""
     falling = dx.LagrangeDirac(lambda q, v: 1e-27 * (v @ v / 2 - q[1]))
@@ -139,6 +141,7 @@ def test_small_units_hide_no_asymmetry():
 
 
 @pytest.mark.parametrize("unit", [(1.0, 1.0, 1.0), (2.0**-33, 2.0**-80, 2.0**-40), (2.0**33, 2.0**80, 2.0**10)])
+@pytest.mark.soak_of(but=["unit1"])
 def test_symmetries_in_other_units(unit):
     """Of lengths and an angle: with lengths of 1e-10, a potential of the angle alone was too small beside ∂L/∂x to be seen."""
     length, mass, time = unit

@@ -23,6 +23,7 @@ def angles(y):
     return jnp.concatenate([y[:3], jnp.stack([jnp.cos(y[3]), jnp.sin(y[3])])])
 
 
+@pytest.mark.soak
 def test_reduction_in_the_angle_is_the_motion_on_the_circle():
     """The angle goes round several times, so that the charts of the manifold change; the angle of the quotient does not end."""
     system = dx.ManifoldLagrangian(kaluza_klein, SPACE)
@@ -39,6 +40,7 @@ def test_reduction_in_the_angle_is_the_motion_on_the_circle():
         assert np.abs(np.asarray(jax.vmap(angles)(jnp.asarray(lifted.q))) - whole.q).max() < 1e-10
 
 
+@pytest.mark.soak
 def test_two_arms_on_a_torus_with_a_common_turn():
     """On T² in angles the symmetry is oblique: found, made a coordinate by a linear change, reduced, and undone modulo 2π."""
     torus = dx.Torus(2)

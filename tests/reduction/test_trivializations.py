@@ -148,6 +148,7 @@ def by_point(mu):
 
 
 @pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.soak_of("1")
 def test_printed_lagrange_poincare_dirac_equations(sign):
     """(4.6) and (4.8), line by line, on a trajectory of the scheme; and not next to it.
 

@@ -316,6 +316,7 @@ def test_a_lagrangian_singular_together_with_its_constraints():
     assert dx.simulate(bound, PLUS, q=[0.0, 1.0], v=[1.0, 0.0], step=0.1, steps=2).ok  # the constraint makes it regular
 
 
+@pytest.mark.soak
 def test_a_projection_that_a_singular_lagrangian_does_not_determine():
     """q2 = q0 whatever the motion, which Method 1 finds; the velocity that belongs to p on the circle is not determined."""
     rod = dx.LagrangeDirac(
@@ -361,6 +362,7 @@ def explicit_half_line(q, v, h, steps):
 
 
 @pytest.mark.parametrize("engine", ["xla", "native"])
+@pytest.mark.soak_of("xla")
 def test_leaving_the_domain_keeps_what_was_computed(engine):
     rows = explicit_half_line(1.0, 0.0, 0.01, 1000)
     last = len(rows) - 1
@@ -455,6 +457,7 @@ def test_a_step_that_becomes_singular():
 
 @pytest.mark.parametrize("engine", ["xla", "native"])
 @pytest.mark.parametrize("batch", [False, True])
+@pytest.mark.soak_of("False-xla", "True-xla")
 def test_ctrl_c_keeps_what_was_computed(batch, engine):
     """The signal itself, sent while the run reports its progress."""
     seen = []

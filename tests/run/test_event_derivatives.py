@@ -43,6 +43,7 @@ def exact(given):
     return jnp.stack([up, down, falls(0.0)[1]])
 
 
+@pytest.mark.soak
 def test_times_and_places_of_events():
     at = np.array([0.5, 1.0, 1.0, 0.8])
     jacobian, (values, *whole) = jax.jit(jax.jacfwd(measured, has_aux=True))(at)
@@ -68,6 +69,7 @@ def swung(a, step=0.1, steps=40, events=PASSES):
     return dx.simulate(SWING, dx.LagrangeDAlembert(), q=[a[0]], v=[0.3], params=params, step=step, steps=steps, events=events)
 
 
+@pytest.mark.soak
 def test_events_are_those_of_plain_runs_and_nothing_is_lost_by_vmap():
     """Dips between the points at which a function is looked at, functions that close over what is traced, several steps."""
     at, lowest = jnp.array([1.0, 0.2]), dx.simulate(
@@ -90,6 +92,7 @@ def test_events_are_those_of_plain_runs_and_nothing_is_lost_by_vmap():
     np.testing.assert_array_equal(jax.jit(jax.vmap(slope))(steps), [alone(h) for h in steps])
 
 
+@pytest.mark.soak
 def test_second_derivatives_of_an_event():
     def cost(a):
         events = swung(a).events
@@ -112,6 +115,7 @@ def test_second_derivatives_of_an_event():
     ],
     ids=lambda s: type(s).__name__,
 )
+@pytest.mark.soak_of("VariableSteps")
 def test_every_kind_of_dense_output(scheme):
     swing = dx.LagrangeDirac(lambda q, v, params: v @ v / 2 - params["k"] * q @ q / 2)
     event = dx.Event(lambda t, q, v, params: q[0] - params["c"] * (1 + t / 50) + v[0] / 30, direction=-1)

@@ -18,6 +18,7 @@ def position(q):
 
 
 @pytest.mark.parametrize("engine", ["native", "xla"])
+@pytest.mark.soak_of("xla")
 def test_zeros_are_found_inside_the_steps(engine):
     events = [dx.Event(position), dx.Event(lambda t, v: v[0] + 0.0 * t, direction=-1), dx.Event(lambda q: q[0] - 0.99999)]
     sol = dx.simulate(OSCILLATOR, dx.Collocation(8), engine=engine, events=events, **START)
@@ -131,6 +132,7 @@ def test_bad_arguments_of_an_event_are_refused():
 
 
 @pytest.mark.parametrize("scheme", [dx.LagrangeDAlembert(), dx.Collocation(3)], ids=lambda s: type(s).__name__)
+@pytest.mark.soak_of("LagrangeDAlembert")
 def test_many_steps_are_looked_through_as_few_are(scheme, monkeypatch):
     system = dx.LagrangeDirac(
         lambda t, q, v: v @ v / 2 - q @ q / 2 - q[0] ** 2 * q[1] + q[1] ** 3 / 3 + 0.01 * jax.numpy.cos(t) * q[0]

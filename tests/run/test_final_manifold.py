@@ -13,6 +13,7 @@ SCHEMES = [dx.LagrangeDAlembert(), dx.DiscreteDirac()]
 
 
 @pytest.mark.parametrize("scheme", SCHEMES, ids=["lagrange-dalembert", "method 1"])
+@pytest.mark.soak_of(but=["method 1"])
 def test_data_off_the_final_manifold(scheme):
     with pytest.raises(ValueError, match=r"singular at the initial data.*off its final constraint manifold.*0\.7.*project=True"):
         dx.simulate(FLAT, scheme, **OFF)
@@ -34,6 +35,7 @@ def test_the_values_of_all_constraints_are_said():
         dx.simulate(system, dx.LagrangeDAlembert(), q=[1.0, 0.0], v=[0.0, 1.0], step=0.01, steps=10)
 
 
+@pytest.mark.soak
 def test_each_trajectory_of_a_batch():
     q = np.array([[1.0, 0.0], [1.0, 0.2]])
     run = {"q": q, "v": np.zeros((2, 2)), "step": 0.1, "steps": 3}
@@ -50,6 +52,7 @@ def test_what_ran_before_decides_nothing():
             dx.simulate(FLAT, dx.DiscreteDirac(), **(OFF | {"q": np.array([1.0, 0.7]) * length}))
 
 
+@pytest.mark.soak
 def test_each_of_two_points():
     """Two points give no momentum: each is on the manifold if a point of it lies over it."""
     for q0, q1, wrong in (((1.0, 0.7), (1.0, -0.7), "q0="), ((1.0, 0.0), (0.99, 0.1), "q1=")):
@@ -76,6 +79,7 @@ def test_a_velocity_that_the_system_determines_is_a_guess():
 
 
 @pytest.mark.parametrize("coefficients", ["suzuki4", "kahan-li8"])
+@pytest.mark.soak_of("suzuki4")
 def test_compositions_of_steps_that_leave_the_final_manifold(coefficients):
     curved = dx.LagrangeDirac(lambda q, v: q[1] * (1 + q[0] ** 2) * v[0] - q @ q / 2)
     lotka = gallery.get("lotka-volterra")
@@ -89,6 +93,7 @@ def test_compositions_of_steps_that_leave_the_final_manifold(coefficients):
     assert dx.simulate(lotka.system, resolved, q=[0.5, 1.2], params=lotka.params, step=0.05, steps=5).ok
 
 
+@pytest.mark.soak
 def test_a_linear_one_form_keeps_the_order_of_a_composition():
     linear = dx.LagrangeDirac(lambda q, v: q[1] * v[0] - q @ q / 2 - q[0] ** 4 / 4)
     found = dx.convergence(
@@ -97,6 +102,7 @@ def test_a_linear_one_form_keeps_the_order_of_a_composition():
     assert abs(found.order - 4) < 0.3
 
 
+@pytest.mark.soak
 def test_a_lagrangian_that_is_singular_in_some_trajectories():
     """The first one is regular, and says nothing of the others."""
     system = dx.LagrangeDirac(lambda q, v, params: params["m"] @ (v * v) / 2 - q @ q / 2)
@@ -128,6 +134,7 @@ def test_a_trajectory_that_leaves_the_manifold():
 
 
 @pytest.mark.parametrize("scheme", [dx.Collocation(2), dx.Collocation(3, nodes="lobatto"), dx.EnergyCollocation(2)])
+@pytest.mark.soak_of(but=["scheme1"])
 def test_collocation_of_a_singular_lagrangian_names_its_premise(scheme):
     coupled = dx.LagrangeDirac(lambda q, v: v[0] ** 2 / 2 - (q[0] ** 2 + q[0] * q[1] + 2 * q[1] ** 2) / 2)
     start = {"q": [1.0, -0.25], "v": [0.0, 0.0]}

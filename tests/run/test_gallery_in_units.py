@@ -91,6 +91,7 @@ def compared(name, scheme, **more):
 
 
 @pytest.mark.parametrize("scheme", ["lagrange-dalembert", "lobatto"])
+@pytest.mark.soak_of("lobatto")
 def test_a_ball_on_a_turntable_in_other_units(scheme):
     """Its first momentum was wrong by 1.5e-5, without a word: masses of 2⁻⁶² beside rolling."""
     compared("turntable", SCHEMES[scheme])
@@ -130,6 +131,7 @@ def test_data_are_projected_in_other_units():
     compared("rolling-disk", SCHEMES["lagrange-dalembert"], steps=2, away=0.01, project=True)
 
 
+@pytest.mark.soak
 def test_the_constraint_algorithm_in_other_units():
     """Its ranks were not constant in some: samples around a point were as far away as 1 + |x|."""
     compared_chains("cartesian-double-pendulum")

@@ -31,6 +31,7 @@ def measured(given, start=(0.0, 0.3)):
     return xp.concatenate([sol.q[:, -1].ravel(), sol.p[:, -1].ravel(), of_lane(0), of_lane(1)])
 
 
+@pytest.mark.soak
 def test_derivatives_of_two_bounces():
     at = np.array([1.0, 0.1, 1.0, -0.2, 0.8])
     jacobian, values = jax.jit(jax.jacfwd(lambda a: (measured(a),) * 2, has_aux=True))(at)
@@ -95,6 +96,7 @@ PEG = dx.Impact(lambda q: jnp.sum((q - jnp.array([0.93, 0.466])) ** 2) - 0.01**2
     ],
     ids=["a thin peg", "up from a wall", "onto a wall at once"],
 )
+@pytest.mark.soak_of(but=["up from a wall"])
 def test_impacts_are_those_of_other_runs(case):
     start, walls, x = case
     x = np.array(x)
@@ -109,6 +111,7 @@ def test_impacts_are_those_of_other_runs(case):
 
 
 @pytest.mark.parametrize("engine", ["auto", "xla"])
+@pytest.mark.soak
 def test_a_ball_may_begin_at_rest(engine):
     """All unknowns of its first step were without a size by JAX alone: it stayed where it was for that step."""
     g = 1.3
@@ -153,6 +156,7 @@ class Verlet(dx.AbstractScheme):
         (dx.EnergyCollocation(3), 0.25, 1),
     ],
 )
+@pytest.mark.soak_of(but=["scheme2-0.25-2"])
 def test_an_impact_on_a_row_has_the_derivatives_of_others(scheme, step, order):
     """From 1 with g = 2 the first one is at t = √(2/g) = 1; a step of 0.25 ends there."""
     ball = dx.LagrangeDirac(lambda q, v, params: v @ v / 2 - params * q[0])
@@ -191,6 +195,7 @@ def test_trajectories_that_end_under_jit():
     assert np.all(np.isfinite(behind[0])) and np.all(np.isnan(behind[1:]))
 
 
+@pytest.mark.soak
 def test_reverse_mode_and_second_derivatives():
     """A ball falls from height y onto a floor at 0: y(T) = e u s − s²/2 with u = √(2y) = t₁ and s = T − t₁."""
     ball, end = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[0]), 2.0

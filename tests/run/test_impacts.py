@@ -16,6 +16,7 @@ FALL = np.sqrt(2.0)
 
 
 @pytest.mark.parametrize("engine", ["native", "xla"])
+@pytest.mark.soak_of("native")
 def test_a_ball_bounces_at_the_right_times_and_keeps_its_energy(engine):
     sol = dx.simulate(BALL, dx.LagrangeDAlembert(), step=0.05, steps=200, events=[FLOOR], engine=engine, **DROP)
     events = sol.events
@@ -123,6 +124,7 @@ LONG = {  # system, scheme, wall, data, steps for an impact, (energy, momentum) 
 
 @pytest.mark.parametrize("impacts", [300, pytest.param(10**6, marks=pytest.mark.soak)])
 @pytest.mark.parametrize("name", ["particle", "ellipse", pytest.param("rolling ball", marks=pytest.mark.soak)])
+@pytest.mark.soak_of("ellipse-300")
 def test_a_million_impacts_leave_energy_and_momentum_where_they_are(name, impacts):
     system, scheme, wall, given, steps, kept = LONG[name]
     sol = dx.simulate(system, scheme, events=[wall], steps=int(steps * impacts), **given)
@@ -170,6 +172,7 @@ def test_an_ellipse_bounces(scheme):
     assert np.max(np.abs(sol.energy() - sol.energy()[0])) <= 2e-14
 
 
+@pytest.mark.soak
 def test_a_blade_stays_on_its_line_through_impacts():
     blade = dx.LagrangeDirac(
         lambda q, v: (v[0] ** 2 + v[1] ** 2 + 0.5 * v[2] ** 2) / 2, lambda q: jnp.array([[jnp.sin(q[2]), -jnp.cos(q[2]), 0.0]])
@@ -184,6 +187,7 @@ def test_a_blade_stays_on_its_line_through_impacts():
 
 
 @pytest.mark.parametrize("scheme", [dx.LagrangeDAlembert(), dx.Collocation(3, nodes="lobatto")], ids=lambda s: type(s).__name__)
+@pytest.mark.soak_of("LagrangeDAlembert")
 def test_a_rod_is_as_long_after_an_impact(scheme):
     rod = dx.LagrangeDirac(lambda q, v: v @ v / 2 - 9.81 * q[1], holonomic=lambda q: jnp.array([(q @ q - 1) / 2]))
     wall = dx.Impact(lambda q: q[0] + 0.2)
@@ -201,6 +205,7 @@ SLOPE = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[1] - 0.1 * q[0] ** 2)
     [dx.EnergyCollocation(2), dx.VariableSteps(dx.Collocation(4), lambda q: 1 + q @ q), dx.Collocation(4)],
     ids=lambda s: type(s).__name__,
 )
+@pytest.mark.soak_of(but=["Collocation"])
 def test_schemes_with_more_in_their_state(scheme):
     """q₁ is a fall onto the floor, exactly; q₀ swings in between, and there is energy at every impact."""
     sol = dx.simulate(SLOPE, scheme, step=0.1, steps=120, events=[FLOOR], **DROP)
@@ -249,6 +254,7 @@ def test_the_search_and_the_step_onto_the_wall_agree(monkeypatch):
     assert np.max(np.abs(fast.events.t[:4] - slow.events.t[:4])) <= 1e-11
 
 
+@pytest.mark.soak
 def test_walls_that_are_far_away_are_not_searched_for(monkeypatch):
     searched, search = [], Flight._searched
     monkeypatch.setattr(Flight, "_searched", lambda *at: searched.append(at) or search(*at))
@@ -276,6 +282,7 @@ def test_impacts_that_accumulate_end_the_run():
     assert not dead.ok and "Zeno" in dead.message and dead.t[-1] <= FALL
 
 
+@pytest.mark.soak
 def test_many_walls_at_one_moment_are_no_accumulation():
     balls = dx.LagrangeDirac(lambda q, v: v @ v / 2 - jnp.sum(q))
     walls = [dx.Impact(gap) for gap in (
@@ -286,6 +293,7 @@ def test_many_walls_at_one_moment_are_no_accumulation():
 
 
 @pytest.mark.parametrize(("v", "step", "steps"), [((3.0, -3.0), 0.1, 100), ((-0.5 / 2.1, 0.5 / 2.1), 0.7, 40)])
+@pytest.mark.soak_of("v0-0.1-100")
 def test_a_corner_is_two_walls(v, step, steps):
     """It is hit at the end of a step, of which roundoff is left: too little to come off a wall that was passed by roundoff."""
     free = dx.LagrangeDirac(lambda q, v: v @ v / 2)
@@ -359,6 +367,7 @@ WALL = 0.3
     ],
     ids=["forces", "a wall that takes energy", "a wall that moves"],
 )
+@pytest.mark.soak
 def test_what_impacts_do_to_energy_and_multipliers_is_no_violation(forces, gap, restitution):
     rod = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[1], holonomic=lambda q: jnp.array([q @ q - 1.0]), forces=forces)
     sol = dx.simulate(
@@ -371,6 +380,7 @@ def test_what_impacts_do_to_energy_and_multipliers_is_no_violation(forces, gap, 
 
 
 @pytest.mark.parametrize("save_every", [1, 5])
+@pytest.mark.soak_of("1")
 def test_all_flights_are_replayed_but_for_the_steps_that_walls_divide(save_every):
     wall = dx.Impact(lambda q: q[1], restitution=0.8)
     start = {"q": [[0.0, 1.0], [0.0, 2.0]], "v": [[0.3, 0.0], [0.3, 0.0]], "step": 0.05, "steps": 100}
@@ -391,6 +401,7 @@ def test_verify_sees_an_energy_that_a_wall_at_rest_has_changed():
 
 @pytest.mark.parametrize("row", [0, 1])
 @pytest.mark.parametrize("name", ["q", "p", "work"])
+@pytest.mark.soak_of("q-0")
 def test_the_rows_beside_a_wall_are_looked_at_too(row, name):
     """The one before ends a step of the scheme, and from the one after another begins."""
     driven = dx.LagrangeDirac(
@@ -413,6 +424,7 @@ def test_walls_that_close_in_on_a_motion_end_it():
 
 
 @pytest.mark.parametrize("scheme", [dx.LagrangeDAlembert(), dx.Collocation(2)], ids=lambda s: type(s).__name__)
+@pytest.mark.soak_of("LagrangeDAlembert")
 def test_thin_pegs_are_hit_wherever_they_are_in_a_step(scheme):
     """A free particle and round pegs of a tenth of a step across, at the row and on it too: four of forty were passed through."""
     free, centres = dx.LagrangeDirac(lambda q, v, c: v @ v / 2 + 0.0 * c), np.append(2.0 + 0.8 * np.arange(32) / 32, [2.02, 2.42])
@@ -423,6 +435,7 @@ def test_thin_pegs_are_hit_wherever_they_are_in_a_step(scheme):
     np.testing.assert_allclose(sol.events.t, centres - 0.02, rtol=0, atol=1e-12)
 
 
+@pytest.mark.soak
 def test_a_thin_peg_is_hit_after_a_wall_in_the_same_step():
     free, wall = dx.LagrangeDirac(lambda q, v, c: v @ v / 2 + 0.0 * c[0]), dx.Impact(lambda q: 1.1 - q[0] - 0.2 * q[1])
     normal = np.array([1.0, 0.2]) / np.hypot(1.0, 0.2)

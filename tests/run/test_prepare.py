@@ -53,6 +53,7 @@ def fresh(system, scheme, **arguments):
 
 
 @pytest.mark.parametrize("name", ["rolling-disk", "henon-heiles", "heavy-top", "cartesian-double-pendulum", "lc-ladder"])
+@pytest.mark.soak_of("rolling-disk", "cartesian-double-pendulum")
 def test_later_runs_of_the_gallery_have_the_bits_of_the_first(name, planned):
     example = gallery.get(name)
     dx.clear_caches()
@@ -100,6 +101,7 @@ def test_other_params_and_other_kinds_of_data(planned):
         ),
     ],
 )  # fmt: skip
+@pytest.mark.soak_of("system4-data4-params4-changes4-singular")
 def test_every_premise_is_checked(system, data, params, changes, message, planned):
     run = dx.prepare(system, MIDPOINT, **data, params=params, **STEP)
     run()
@@ -146,6 +148,7 @@ def test_batches_begin_by_a_plan_with_the_bits_of_a_first_run(batch_params, plan
         ),
     ],
 )  # fmt: skip
+@pytest.mark.soak_of("system0-data0-params0-changes0-singular")
 def test_every_premise_of_a_batch_is_checked(system, data, params, changes, message, planned):
     run = dx.prepare(system, MIDPOINT, **data, params=params, batch_params=params is not None, **STEP)
     assert run().ok.all() and planned
@@ -153,6 +156,7 @@ def test_every_premise_of_a_batch_is_checked(system, data, params, changes, mess
         run(**changes)
 
 
+@pytest.mark.soak
 def test_a_singular_lagrangian_is_asked_again_for_its_final_manifold(planned):
     """∂²L/∂v² is singular for m₁ = 0, and then sin q₁ = 0: what was accepted there once says nothing of another point."""
     run = dx.prepare(MASS, MIDPOINT, q=[0.3, 0.0], v=[0.2, 0.0], params={"m": np.ones(2)}, **STEP)
@@ -189,6 +193,7 @@ def test_extending_has_the_bits_of_one_run(scheme, first, more, every):
 
 
 @pytest.mark.parametrize("engine", ["native", "xla"])
+@pytest.mark.soak_of("xla")
 def test_extending_batches_and_two_points(engine):
     rng = np.random.default_rng(0)
     given = {"q": rng.uniform(size=(5, 2)), "v": rng.uniform(size=(5, 2)), "step": 0.1, "save_every": 2, "engine": engine}

@@ -26,6 +26,7 @@ RUN = {"q": [1.0, 0.0], "v": [0.0, 1.0], "step": 0.01, "steps": 200}
 
 @pytest.mark.parametrize("scheme", SCHEMES)
 @pytest.mark.parametrize("scale", [1.0, 2.0**-40, 2.0])
+@pytest.mark.soak
 def test_a_load_that_is_not_determined_is_refused_and_one_that_is_slows_the_bead(scheme, scale):
     for share in ([1.0, 0.0], [0.0, 1.0], [1.0, scale * 1.001]):
         with pytest.raises(ValueError, match=r"nothing determines: the constraints \(holonomic\) have rank 1 of 2"):
@@ -34,6 +35,7 @@ def test_a_load_that_is_not_determined_is_refused_and_one_that_is_slows_the_bead
     assert np.linalg.norm(sol.p[-1]) == pytest.approx(1 / (1 + 2 * FRICTION), abs=1e-4)  # v̇ = −μ v² on the unit circle
 
 
+@pytest.mark.soak
 def test_the_same_under_transformations_of_jax():
     speed = lambda share: lambda friction: jnp.linalg.norm(dx.simulate(bead(share), SCHEMES[0], **RUN, params=friction).p[-1])
     for transformed in (jax.grad, jax.jit):
@@ -57,6 +59,7 @@ def test_a_block_on_four_feet_is_refused_and_on_three_it_runs():
     assert block(feet[:3]).ok
 
 
+@pytest.mark.soak
 def test_they_are_reported_beside_walls_too():
     twice = lambda q: jnp.stack([q[1], 2.0 * q[1]])
     system = dx.LagrangeDirac(lambda q, v: v @ v / 2, holonomic=twice)

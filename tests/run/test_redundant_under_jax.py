@@ -26,12 +26,14 @@ def end(m, r=1.0, scheme=SCHEMES[0]):
 
 
 @pytest.mark.parametrize("scheme", SCHEMES, ids=repr)
+@pytest.mark.soak
 def test_derivatives_of_a_run_that_leaves_one_out(scheme):
     found = jax.grad(end, (0, 1))(2.0, 1.0, scheme)
     by_hand = [(end(2.0 + a, 1.0 + b, scheme) - end(2.0 - a, 1.0 - b, scheme)) / 2e-5 for a, b in ((1e-5, 0), (0, 1e-5))]
     np.testing.assert_allclose(found, by_hand, atol=1e-8)
 
 
+@pytest.mark.soak
 def test_compiled_where_the_constraints_are_not_traced():
     by_mass = lambda m: end(m)
     np.testing.assert_allclose(jax.jit(jax.grad(by_mass))(2.0), jax.grad(by_mass)(2.0), rtol=1e-12)

@@ -81,6 +81,7 @@ def test_multipliers_belong_to_the_step_that_leaves_a_row():
 
 
 @ENGINES
+@pytest.mark.soak_of("xla")
 def test_a_batch_is_its_trajectories(engine):
     q = np.linspace(0.5, 1.5, 5)[:, None]
     v = np.array([[0.2], [0.0], [-1.0], [3.0], [0.1]])
@@ -100,6 +101,7 @@ def test_one_entry_may_have_the_batch_axis_alone():
 
 
 @ENGINES
+@pytest.mark.soak_of("xla")
 def test_parameters_with_a_batch_axis(engine):
     params = {"m": np.array([1.0, 2.0, 0.5]), "k": np.array([1.0, 1.0, 3.0])}
     sol = dx.simulate(SPRING, PLUS, q=[1.0], v=[0.0], params=params, batch_params=True, step=0.1, steps=20, engine=engine)
@@ -141,6 +143,7 @@ def test_gradient_against_the_closed_form():
 
 
 @pytest.mark.parametrize("engine", ["native", "xla"])
+@pytest.mark.soak_of("xla")
 def test_a_second_gradient_compiles_nothing(engine, compiled):
     def end(q, step):
         sol = dx.simulate(SPRING, PLUS, q=q, v=[0.3], params={"m": 1.0, "k": 2.0}, step=step, steps=3, engine=engine)
@@ -152,6 +155,7 @@ def test_a_second_gradient_compiles_nothing(engine, compiled):
     assert 0 < first == len(compiled)
 
 
+@pytest.mark.soak
 def test_gradient_with_constraints_against_finite_differences():
     """Initial position, velocity along the constraint and a parameter, for the final position, momentum and multiplier."""
     scheme = dx.LagrangeDAlembert()
@@ -229,6 +233,7 @@ class KickDrift(dx.AbstractScheme):
 
 
 @ENGINES
+@pytest.mark.soak_of("xla")
 def test_stages_of_different_sizes(engine):
     """Φ_{h/2} ∘ Φ*_{h/2} is Störmer–Verlet; its adjoint stage has two unknowns and the other none."""
     sol = dx.simulate(OSCILLATOR, dx.SymmetricComposition(KickDrift()), q=[1.0], v=[0.3], step=0.2, steps=30, engine=engine)
@@ -270,6 +275,7 @@ def test_a_progress_bar_is_shown_and_removed(capsys):
     assert "Traceback" not in capsys.readouterr().err
 
 
+@pytest.mark.soak
 def test_equal_runs_compile_once(compiled):
     """Another step size, time, start or parameter value reuses the compiled code."""
     run = lambda **change: dx.simulate(
@@ -287,6 +293,7 @@ def test_equal_runs_compile_once(compiled):
 
 
 @ENGINES
+@pytest.mark.soak_of("xla")
 def test_runs_are_reproducible(engine):
     run = lambda: dx.simulate(
         SKATE, PLUS, q=[0.0, 0.0, 0.3], v=[np.cos(0.3), np.sin(0.3), 1.0], params=2.0, step=0.05, steps=50, engine=engine
@@ -338,6 +345,7 @@ class Incline:
 
 
 @pytest.mark.parametrize("engine", ["native", "xla"])
+@pytest.mark.soak_of("xla")
 def test_params_are_not_made_twice(engine):
     """What __post_init__ does to the numbers of a user was done again to its own result."""
     system = dx.LagrangeDirac(lambda q, v, on: v @ v / 2 - 9.81 * on.steep * q[0] / 2 - on._pull * q[0] / 2)
@@ -352,6 +360,7 @@ def test_params_are_not_made_twice(engine):
 
 
 @pytest.mark.parametrize("engine", ["native", "xla", "sparse"])
+@pytest.mark.soak_of(but=["xla"])
 def test_a_last_row_that_needs_a_step_which_has_no_solution_is_warned_of(engine):
     """The saved momentum is that between two steps: with ok=True it was off by a fifth, without a word."""
     chain = gallery.get("hanging-chain")

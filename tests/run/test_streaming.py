@@ -60,6 +60,7 @@ def same(ours, theirs):
 
 
 @pytest.mark.parametrize(("name", "every"), [*((name, 1) for name in RUNS), ("native", 3), ("sparse", 3), ("two points", 3)])
+@pytest.mark.soak_of("xla-1", "sparse-1", "multipliers-1", "a batch-1", "a batch with a failure-1")
 def test_has_the_bits_of_a_run_in_memory(name, every, tmp_path):
     path, theirs = tmp_path / "run.zarr", run(name, 40, save_every=every)
     first = run(name, 11, save_every=every, to=path)

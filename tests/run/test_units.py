@@ -106,6 +106,9 @@ CASES = [
 
 @pytest.mark.parametrize(("case", "scheme"), CASES)
 @pytest.mark.parametrize("engine", ["native", "xla"])
+@pytest.mark.soak_of(
+    "xla-sleigh-trapezoidal", "xla-sleigh-minus", "xla-sleigh-method 1", "xla-kepler-suzuki4", "xla-kepler-symmetric"
+)
 def test_every_bit_in_other_units(case, scheme, engine):
     plain = case.run(Units(), scheme, engine, case.system())
     assert plain.ok
@@ -146,6 +149,7 @@ def test_a_start_that_is_a_root(scheme):
         np.testing.assert_allclose(scaled.q / units.of(LENGTH), plain.q, rtol=1e-13, atol=1e-13)
 
 
+@pytest.mark.soak
 def test_what_fails_fails_in_any_units():
     """A pendulum of 1.2e-10 with h = .9, and Kepler's problem with h = .7, were "solved" while updates were compared with 1.
     Newton's method wanders before it fails, from a first momentum that is known to a rounding: at which step is not the same."""
@@ -229,6 +233,7 @@ def test_initial_data_of_every_system_are_judged_by_their_terms(name):
             run(**scaled(off), **rest, **more)
 
 
+@pytest.mark.soak
 def test_a_corrupted_trajectory_is_found_in_any_units():
     for units in (Units(), Units(length=-50)):
         sol = SLEIGH.run(units, dx.LagrangeDAlembert(), "native")
@@ -245,6 +250,7 @@ def test_small_masses_beside_one_forms():
         assert SLEIGH.run(Units(mass=mass), dx.LagrangeDAlembert(), "native").ok
 
 
+@pytest.mark.soak
 def test_verdicts_in_other_units():
     for case, scheme in ((PENDULUM, dx.LagrangeDAlembert()), (SLEIGH, dx.PlusLagrangeDirac())):
         for units in (Units(), UNITS[0], UNITS[2]):
@@ -252,6 +258,7 @@ def test_verdicts_in_other_units():
             assert "VIOLATED" not in [line.verdict for line in report.lines]
 
 
+@pytest.mark.soak
 def test_a_bicycle_that_goes_nearly_straight():
     """The rate of a constraint whose terms all vanish at upright is judged by how fast they could be, not by roundoff."""
 
@@ -322,6 +329,7 @@ TINY_BALL = Units(length=-30, mass=-86, time=-20)
 
 
 @pytest.mark.parametrize("restitution", [1.0, 0.5])
+@pytest.mark.soak_of("0.5")
 def test_impacts_in_other_units(restitution):
     """One that ends in a corner with ever more impacts, and one that begins on the floor."""
     for data in ({"q": [0.1, 1.0], "v": [0.9, 0.0]}, {"q": [0.0, 0.0], "v": [0.3, 0.7]}):
@@ -344,6 +352,7 @@ GRADIENT_UNITS = (Units(mass=-80), Units(length=-60, mass=60, time=-20))
 
 
 @pytest.mark.parametrize("engine", ["native", "xla"])
+@pytest.mark.soak
 def test_derivatives_in_other_units(engine):
     """A sleigh that goes nearly along x: the entry 1e-8 of its one-form was a pivot with masses of 2⁻⁸⁰, and derivatives backward
     were off by 3e-7."""
@@ -379,6 +388,7 @@ SMALL = ((1e-9, 1.0), (1.0, 1e-20))
 
 
 @pytest.mark.parametrize(("length", "mass"), SMALL)
+@pytest.mark.soak_of("1e-09-1.0")
 def test_inertias_of_small_machines(length, mass):
     """Moments of inertia of 1e-19 beside masses of 1 are not roundoff: on a circle, from the closed form."""
     skate = dx.NonholonomicMechanics(lambda q, P: jnp.diag(jnp.stack([P["m"], P["m"], P["J"]])), lambda q, P: 0 * q[0], SKATE)
@@ -394,6 +404,7 @@ def test_inertias_of_small_machines(length, mass):
     np.testing.assert_allclose(sol.x[-1], x, rtol=1e-12, atol=1e-12 * mass * length)
 
 
+@pytest.mark.soak
 def test_orbits_that_are_small_are_free():
     """In polar coordinates: at a radius of 1e-9 the angle has the inertia 1e-18, and at the origin none."""
     particle = dx.LagrangeDirac(lambda q, v, l: (v[0] ** 2 + q[0] ** 2 * v[1] ** 2) / 2 - (q[0] - l) ** 2)
@@ -445,6 +456,7 @@ def test_small_masses_beside_constraints_of_a_hamiltonian(scheme):
 @pytest.mark.parametrize(
     "units", [Units(length=-33, mass=-87, time=-40), Units(length=40, mass=-80, time=-20), Units(-33, 101, 25)]
 )
+@pytest.mark.soak_of(but=["units1"])
 def test_the_constraint_algorithm_beside_small_forces(units):
     """A skate on the plane: velocities and forces in rows of their own, and an angle that stands in the one-form alone."""
     hamiltonian = lambda x, P: (x[3] ** 2 + x[4] ** 2) / P["m"] / 2 + x[5] ** 2 / 2 / P["J"]

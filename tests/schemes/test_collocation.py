@@ -38,6 +38,7 @@ def pendulum_reference(t, damping=0.0, pull=0.0):
 
 
 @pytest.mark.parametrize("stages", [1, 2, 5, 8, 16])
+@pytest.mark.soak_of("16")
 def test_gauss_is_exact_to_the_last_bit(stages):
     # exact for polynomials of degree 47
     integral = lambda function, end: mpmath.quad(function, [0, end], method="gauss-legendre", maxdegree=4)
@@ -90,6 +91,7 @@ def test_order_in_positions_momenta_and_work(stages, steps, forces):
 
 
 @pytest.mark.parametrize(("stages", "steps"), [(2, (200, 400, 800)), (3, (60, 90, 120)), (4, (40, 60, 90))])
+@pytest.mark.soak_of(but=["3-steps1"])
 def test_lobatto_has_order_two_less_and_is_symplectic(stages, steps):
     force = lambda t, q, v, params: jnp.array([0.4 * jnp.cos(t), 0.0]) - 0.2 * v
     q, p, work = pendulum_reference(1.5, 0.2, 0.4)
@@ -162,6 +164,7 @@ ALSO_BY_XLA = "rigid body", "rates of a mass matrix"
 
 
 @pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.soak_of("rates of a mass matrix", "rigid body")
 def test_engines_agree_and_halved_steps_change_nothing_at_high_order(name):
     system, data, step = SYSTEMS[name]
     run = lambda h, n, **more: dx.simulate(system, dx.Collocation(5), step=h, steps=n, **data, **more)
@@ -296,6 +299,7 @@ def test_systems_that_it_does_not_step_are_refused():
 
 
 @pytest.mark.parametrize("scheme", [dx.Collocation(3), dx.EnergyCollocation(2), dx.DiscreteDirac(constraints="resolve")])
+@pytest.mark.soak_of(but=["scheme2"])
 def test_a_structure_that_leaves_rates_open_is_refused(scheme):
     """Gauss ran, and verify called the constraint violated; the other named the inverse of a singular matrix."""
     knife = lambda q: jnp.array([[jnp.sin(q[2]), -jnp.cos(q[2]), 0.0]])

@@ -35,6 +35,7 @@ def mean_tension(intervals):
     ("name", "order", "engine"),
     [("suzuki4", 4, "native"), ("yoshida4", 4, "native"), ("kahan-li6", 6, "native"), ("yoshida4", 4, "xla")],
 )
+@pytest.mark.soak_of("yoshida4-4-xla")
 def test_the_impulse_of_a_composed_step_is_the_whole_steps(name, order, engine):
     """The first part of a step of suzuki4 has .4145 of the tension, of yoshida4 1.3512."""
     errors = []
@@ -113,6 +114,7 @@ def test_with_one_forms_every_field_has_the_order_of_q(reference, engine, scheme
     assert np.all(slopes[-1] > order - 0.5), (errors, slopes)
 
 
+@pytest.mark.soak
 def test_what_happens_in_a_step_is_that_of_all_its_parts():
     """The power of a step is the energy that it adds, over h."""
     system = dx.PortHamiltonian(

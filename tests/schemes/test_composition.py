@@ -70,6 +70,7 @@ SPREAD = {4: 0.06, 6: 0.2, 8: 0.4}
 
 
 @pytest.mark.parametrize("name", COEFFICIENTS)
+@pytest.mark.soak_of("yoshida4")
 def test_orders_in_q_and_p_are_those_of_the_name(name, compose, exact):
     order = int(name[-1])
     steps = OWN_STEPS.get(name, STEPS[order])
@@ -151,6 +152,7 @@ def test_higher_compositions_of_method_2_keep_the_constraint(name, steps, disk_a
 # -------------------------------------------------------------------------------------------------------------- adjoints
 
 
+@pytest.mark.soak
 def test_the_adjoint_undoes_a_backward_step():
     """Φ*_h ∘ Φ_{−h} = id, for a scheme that is not self-adjoint, by the generic equation and within the family."""
     explicit = dx.DiscreteDirac(map=dx.Theta(0.0))
@@ -234,6 +236,7 @@ def test_an_inverse_that_is_none_of_all_states_is_refused_as_such():
         dx.simulate(ball, dx.Adjoint(dx.DiscreteDirac(dx.SphereProjection())), q=[1.0, 0, 0], v=[0.0, 1, 0], step=0.1, steps=1)
 
 
+@pytest.mark.soak
 def test_plus_scheme_made_symmetric_is_of_second_order_on_the_disk(disk_at_end):
     """Φ_{h/2} ∘ Φ*_{h/2} of the first-order (+) scheme; p is compared on the constraint, modulo Wᵀμ."""
     lagrangian = disk.lagrange_dirac()

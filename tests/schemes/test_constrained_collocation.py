@@ -123,6 +123,7 @@ OF_MULTIPLIERS = {
         pytest.param("both", 4, marks=pytest.mark.soak),
     ],
 )
+@pytest.mark.soak
 def test_orders_and_constraints(kind, stages):
     _, _, system = KINDS[kind]
     q, v = START[kind]
@@ -148,6 +149,7 @@ def test_orders_and_constraints(kind, stages):
     ("name", "of_multipliers"),
     [("cartesian-double-pendulum", OF_HOLONOMIC), pytest.param("rolling-disk", OF_ONE_FORMS, marks=pytest.mark.soak)],
 )
+@pytest.mark.soak
 def test_orders_on_the_gallery(name, of_multipliers):
     example, end = gallery.get(name), 0.5
     system, params = example.system.lagrangian_form(), example.params
@@ -195,6 +197,7 @@ def test_symplectic_on_the_constraint_manifold():
 
 
 @pytest.mark.parametrize("kind", ["nonholonomic", pytest.param("holonomic", marks=pytest.mark.soak)])
+@pytest.mark.soak
 def test_self_adjoint_and_the_same_on_both_engines(kind):
     lagrangian = KINDS[kind][0]
     even = lambda q, v: (lagrangian(q, v) + lagrangian(q, -v)) / 2  # reversible

@@ -59,6 +59,7 @@ def test_inconsistent_difference_equations_end_empty():
     assert "inconsistent" in chain.explanation and chain.state[3] == pytest.approx(-H / 2, abs=1e-14)
 
 
+@pytest.mark.soak
 def test_the_midpoint_rule_of_an_index_3_pendulum_has_no_constraint():
     """|q̄| = 1 at midpoints determines the tension of the step, whatever the node."""
     chain = dx.discrete_constraint_algorithm(PENDULUM, dx.DiscreteDirac(), near=np.array([0.6, -0.81, 0.3, 0.2]), step=0.01)

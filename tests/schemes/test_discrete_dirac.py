@@ -227,6 +227,7 @@ HIDDEN = {
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.soak) if n == "its two points" else n for n in HIDDEN])
+@pytest.mark.soak_of(but=["an implicit system"])
 def test_method_2_of_constraints_that_are_not_stated_needs_the_chain(name):
     """Method 1 takes these systems; Method 2 says how to have them."""
     system, data, words = HIDDEN[name]

@@ -43,6 +43,7 @@ def test_energy_balance_is_exact(kind):
 
 @pytest.mark.parametrize("constant", [0.0, 1e4])
 @pytest.mark.parametrize("scheme", [*map(DiscreteGradient, KINDS), DiscreteGradient("mean-value", 2)])
+@pytest.mark.soak_of(but=["scheme1-10000.0"])
 def test_a_constant_in_the_hamiltonian_and_damping_leave_the_balance_exact(scheme, constant):
     """The roundoff of H hid its change in short steps, and what they missed added up to 1e-7 of the books."""
 
@@ -143,6 +144,7 @@ def test_a_driven_system_that_comes_to_rest_is_stepped_on(step):
     ("kind", "engine"),
     [*((kind, "native") for kind in KINDS), ("mean-value", "xla"), pytest.param("gonzalez", "xla", marks=pytest.mark.soak)],
 )
+@pytest.mark.soak_of("mean-value-xla")
 def test_a_system_at_rest_starts_and_one_that_comes_to_rest_goes_on(kind, engine):
     scheme = DiscreteGradient(kind)
     quadratic = lambda x: x @ x / 2

@@ -72,6 +72,7 @@ def orders(errors, h):
 
 @pytest.mark.parametrize(("stages", "steps"), [(1, (20, 40, 80)), (2, (10, 20, 40)), (3, (7, 10, 14))])
 @pytest.mark.parametrize("moving", [False, True], ids=["linear", "affine in time"])
+@pytest.mark.soak_of(but=["affine in time-3-steps2"])
 def test_order_in_positions_momenta_and_work(stages, steps, moving):
     system, expected, errors = FORCED[moving], reference(moving), []
     for n in steps:
@@ -92,6 +93,7 @@ def frame(q):
 
 
 @pytest.mark.parametrize(("stages", "steps"), [(2, (20, 40)), (3, (10, 14))])
+@pytest.mark.soak_of("2-steps0")
 def test_order_energy_and_constraint_in_a_frame_of_ones_own(stages, steps):
     system, expected, errors = FORCED[False], reference(False), []
     for n in steps:
@@ -123,6 +125,7 @@ IRREVERSIBLE = {"contact-particle": contact_particle.CASES, "transmission": tran
 
 
 @pytest.mark.parametrize("name", IRREVERSIBLE)
+@pytest.mark.soak
 def test_energy_and_constraint_of_irreversible_systems(name):
     example = gallery.get(name)
     params = {**example.params, **IRREVERSIBLE[name]["irreversible"]}
@@ -147,6 +150,7 @@ def test_energy_and_constraint_of_irreversible_systems(name):
     assert sol.stats["energy_defect"] < 1e-14 and "8 points of the quadrature" in sol.stats["iteration"]
 
 
+@pytest.mark.soak
 def test_a_knife_edge_turns_through_every_direction():
     example = gallery.get("knife-edge")
     data = {"params": example.params, "project": True} | {name: example.initial[name] for name in ("q", "v")}
@@ -159,6 +163,7 @@ def test_a_knife_edge_turns_through_every_direction():
     np.testing.assert_allclose(sol.q[::40], fine.q[::200], atol=2e-6)
 
 
+@pytest.mark.soak
 def test_a_lagrangian_that_is_not_quadratic_in_v():
     system = dx.LagrangeDirac(
         lambda q, v: jnp.cosh(v[0]) + v[1] ** 2 / 2 + v[2] ** 2 / 2 + 0.1 * (v[0] * v[1]) ** 2 - q @ q / 2,
@@ -224,6 +229,7 @@ ALSO_BY_XLA = ("explicit time", "ports", *LONG)
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.soak) if n in LONG else n for n in SYSTEMS])
+@pytest.mark.soak_of(but=["canonical"])
 def test_every_system_with_a_bracket(name):
     system, data, step = SYSTEMS[name]
     run = lambda scheme, h, n, **more: dx.simulate(system, scheme, step=h, steps=n, **data, **more)
@@ -269,6 +275,7 @@ def test_self_adjoint_with_one_forms_in_a_frame_alone():
 
 
 @pytest.mark.parametrize("engine", ["native", pytest.param("xla", marks=pytest.mark.soak)])
+@pytest.mark.soak
 def test_at_rest_where_all_terms_of_the_energy_are_zero(engine):
     oscillator = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q / 2)
 
@@ -299,6 +306,7 @@ class Stated(dx.AbstractScheme):
         return self.equation
 
 
+@pytest.mark.soak
 def test_stiff_bars_set_out_from_rest():
     """Rates that are nothing but roundoff of the stiff forces, by way of the momenta that these make, are at their root."""
     angles = np.linspace(1.0, 0.3, 6)
@@ -317,6 +325,7 @@ def test_stiff_bars_set_out_from_rest():
     assert np.max(np.abs(energy - energy[0])) < 1e-12
 
 
+@pytest.mark.soak
 def test_where_the_fixed_point_does_not_converge_newton_goes_on():
     stiff = dx.LagrangeDirac(
         lambda q, v: v @ v / 2 - 5000.0 * q[0] ** 2 / 2 - q[1] ** 4 / 4, lambda q: jnp.array([[0.0, q[0], 1.0]])
@@ -332,6 +341,7 @@ def test_where_the_fixed_point_does_not_converge_newton_goes_on():
 
 
 @pytest.mark.parametrize("engine", ["native", pytest.param("xla", marks=pytest.mark.soak)])
+@pytest.mark.soak
 def test_gradients_are_those_of_differences(engine):
     system = dx.LagrangeDirac(lambda q, v, params: v @ v / 2 - params["k"] * q @ q / 2, lambda q: jnp.array([[q[1], 0.0, -1.0]]))
 
@@ -417,6 +427,7 @@ def test_systems_that_it_does_not_step_are_refused():
         run(SYSTEMS["no constraints"][0], q0=[0.0, 0.0], q1=[0.1, 0.0])
 
 
+@pytest.mark.soak
 def test_vortices_are_stepped_natively():
     """The matrix of their two-form is constant: the solves of all nodes are traced as one, which falls apart into theirs."""
     sol = gallery.get("vortices").simulate(dx.EnergyCollocation(2), steps=20)
@@ -457,6 +468,7 @@ def averaged_vector_field(data, h, force):
 
 
 @pytest.mark.parametrize("kind", ["Lagrangian", "canonical bracket"])
+@pytest.mark.soak_of(but=["Lagrangian"])
 def test_chains_of_many_coordinates_are_sparse_and_keep_their_energy(kind):
     size, h = 150, 0.1
     q = np.sin(np.arange(size))
@@ -500,6 +512,7 @@ def many_masses(size=2):
 
 
 @pytest.mark.parametrize("made", [many_ports, many_masses])
+@pytest.mark.soak
 def test_steps_of_many_coordinates_are_those_of_few(made, monkeypatch):
     """The same step with other unknowns and equations."""
     run = lambda engine: dx.simulate(made()[0], dx.EnergyCollocation(2, points=4), **made()[1], step=0.1, steps=6, engine=engine)
@@ -534,6 +547,7 @@ def test_a_large_bracket_that_is_not_antisymmetric_is_refused():
         step.check({"x": x}, 0.1, None)
 
 
+@pytest.mark.soak
 def test_three_one_forms_of_a_car_with_a_trailer_are_native():
     """Twenty solves of eight equations side by side were taken for one of 160, and left to XLA, which compiled for 46 s."""
 
@@ -590,7 +604,7 @@ def test_steps_that_contract_slowly_are_solved():
         return jnp.block([[-turn, -jnp.eye(3)], [jnp.eye(3), jnp.zeros((3, 3))]])
 
     system = dx.DiracSystem(dx.DiracStructure.from_two_form(form), lambda x: x[3:] @ x[3:] / 2 + 0.1 * x[2] ** 2)
-    for step, most in [(0.05, 1e-12), (0.025, 1e-14)]:
+    for step, most in [(0.05, 1e-11), (0.025, 1e-14)]:
         sol = dx.simulate(system, dx.EnergyCollocation(), x=[1.0, 0.2, 0.1, 0.1, 0.5, 0.3], step=step, steps=100)
         assert np.max(sol.energy_defect) < most
     assert dx.verify(sol)["steps replayed"].verdict == "ok"

@@ -41,6 +41,7 @@ def orders(errors):
         (dx.Adjoint(dx.MinusLagrangeDirac(momentum="mean")), 1),
     ],
 )
+@pytest.mark.soak_of("scheme0-2-xla", "scheme1-2-xla", "scheme2-1-xla", "scheme3-1-xla", "scheme4-1-xla")
 def test_the_force_on_a_skate_in_the_first_row(scheme, order, engine):
     errors = []
     for h in (0.04, 0.02, 0.01):
@@ -73,6 +74,7 @@ ALL = Kind(4, m=1, c=1, magnetic=True, affine=True, forced=True, timed=True, mov
     ],
     ids=["one-forms", "affine", "all", "all, trapezoidal"],
 )
+@pytest.mark.soak
 def test_second_order_whatever_the_system_has(kind, rule):
     """Against the saddle-point equations of the Lagrangian's own derivatives at the start."""
     system, params, start, p, force, every = at_the_start(kind)
@@ -114,6 +116,7 @@ ON_A_SPHERE = dx.ManifoldLagrangian(
 
 
 @pytest.mark.parametrize("rule", ["midpoint", "trapezoidal"])
+@pytest.mark.soak_of("midpoint")
 def test_in_charts(rule):
     """A pendulum of a sphere with a nonintegrable constraint."""
     run = lambda scheme, steps: dx.simulate(
@@ -141,6 +144,7 @@ def test_nothing_else_has_another_first_row():
 
 
 @pytest.mark.parametrize("scheme", [MEAN, dx.LagrangeDAlembert(momentum="incoming"), dx.PlusLagrangeDirac(momentum="mean")])
+@pytest.mark.soak_of(but=["scheme1"])
 def test_verify_takes_the_first_row_again(scheme):
     sol = skate(scheme, 0.02)
     report = dx.verify(sol)
@@ -154,6 +158,7 @@ HEAVY = dx.LagrangeDirac(lambda q, v, m: m * (v @ v) / 2 + m**2 * q[0], BLADE)
 
 
 @pytest.mark.parametrize("engine", ["native", pytest.param("xla", marks=pytest.mark.soak)])
+@pytest.mark.soak
 def test_it_is_differentiated(engine):
     """L = m|v|²/2 + m g x: the force at the start is 2 m g sin t₀ up to h², with ẋ that of g = 1 where φ̇ = 1. Differences are
     those of runs of the native engine."""
@@ -163,6 +168,7 @@ def test_it_is_differentiated(engine):
     assert found == pytest.approx((first(1.2 + step) - first(1.2 - step)) / (2 * step), rel=1e-7)
 
 
+@pytest.mark.soak
 def test_a_force_that_does_not_act_before():
     """√t at t = 0: a step that would arrive there has none, and its place takes one that comes back to the start."""
     system = dx.LagrangeDirac(

@@ -142,6 +142,7 @@ def test_forces_together_with_nonholonomic_constraints():
         assert slopes(errors) == pytest.approx(2.0, abs=0.2), scheme
 
 
+@pytest.mark.soak
 def test_engines_batches_and_gradients_agree():
     scheme, run = dx.LagrangeDAlembert(), {"step": 0.05, "steps": 40}
     batch = {"q": np.stack([START["q"], 2 * START["q"]]), "v": np.stack([START["v"], -START["v"]])}

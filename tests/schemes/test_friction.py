@@ -67,6 +67,7 @@ def test_one_sided_schemes_keep_their_first_order(scheme):
 @pytest.mark.parametrize(
     ("scheme", "engine"), [*((scheme, "native") for scheme in SLIDES), (SLIDES[0], "xla"), (SLIDES[2], "xla")]
 )
+@pytest.mark.soak_of("scheme3-xla", "scheme4-xla")
 def test_a_block_slides_down_a_slope(scheme, engine):
     """v̇ = g(sin α − μ cos α), exactly, with N = m g cos α."""
     params = {"m": 2.0, "g": 9.81, "grip": 1.0}

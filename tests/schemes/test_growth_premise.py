@@ -17,6 +17,7 @@ CASES = [
 
 
 @pytest.mark.parametrize(("system", "start", "grows", "decays"), CASES, ids=["holonomic", "one-forms", "closed port"])
+@pytest.mark.soak_of("holonomic")
 def test_what_grows_is_refused_and_what_decays_runs(system, start, grows, decays):
     run = start | {"step": 1 / 160, "steps": 160}
     with pytest.raises(ValueError, match=r"by −2\.33, whatever its size.*dx\.Midpoint"):
@@ -30,6 +31,7 @@ def test_what_grows_is_refused_and_what_decays_runs(system, start, grows, decays
 
 
 @pytest.mark.parametrize(("system", "start"), [CASES[0][:2], CASES[1][:2]], ids=["holonomic", "one-forms"])
+@pytest.mark.soak_of("one-forms")
 def test_a_base_point_at_an_end(system, start):
     """θ = 1: W(q_1) ∂H/∂p(q_1, p_0) = 0 has no force in it. What is off it at θ = 0 is gone after a step."""
     run = start | {"step": 1 / 160, "steps": 3}
@@ -52,6 +54,7 @@ def test_the_adjoint_of_what_grows_decays():
     np.testing.assert_allclose(solution.q, expected.q, rtol=0, atol=1e-12)
 
 
+@pytest.mark.soak
 def test_regular_systems_have_nothing_that_grows():
     stiff = dx.LagrangeDirac(lambda q, v: v @ v / 2 - 1e6 * q @ q)
     for theta in (0.0, 0.3, 0.7, 1.0):

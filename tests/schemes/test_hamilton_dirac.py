@@ -25,6 +25,7 @@ START = {"q": np.array([0.1, 0.2, 0.4]), "p": np.array([0.7, 0.1, 0.5])}
 
 
 @pytest.mark.parametrize(("scheme", "other", "engine"), [*((*pair, "native") for pair in SCHEMES), (*SCHEMES[0], "xla")])
+@pytest.mark.soak
 def test_equivalent_to_the_lagrangian_schemes(scheme, other, engine):
     """With a mass matrix of q and a nonintegrable constraint: q, p, multipliers and the discrete constraint."""
     run = {**START, "project": True, "step": 0.02, "steps": 40}
@@ -37,6 +38,7 @@ def test_equivalent_to_the_lagrangian_schemes(scheme, other, engine):
 
 
 @pytest.mark.parametrize("scheme", [scheme for scheme, _ in SCHEMES])
+@pytest.mark.soak
 def test_first_order_and_symplectic_without_constraints(scheme):
     system = dx.HamiltonDirac(hamiltonian)
     force = lambda t, x: np.concatenate([np.asarray(a) for a in (lambda of_q, of_p: (of_p, -of_q))(

@@ -17,6 +17,7 @@ def through_the_pole():
     return pendulums.simulate(steps=1000)
 
 
+@pytest.mark.soak
 def test_the_motion_passes_the_pole_and_keeps_its_energy_band(through_the_pole):
     sol = through_the_pole
     assert sol.ok
@@ -38,6 +39,7 @@ def test_the_motion_passes_the_pole_and_keeps_its_energy_band(through_the_pole):
     ],
     ids=["normal coordinates", "small charts"],
 )
+@pytest.mark.soak
 def test_the_atlas_changes_nothing_but_roundoff(through_the_pole, atlas):
     other = pendulums.simulate(dx.InCharts(dx.RiemannianExp(SPACE, 0.5), atlas), steps=1000)
     assert len(np.unique(other.chart[:, 0])) != len(np.unique(through_the_pole.chart[:, 0]))
@@ -75,6 +77,7 @@ def test_away_from_the_poles_charts_and_angles_follow_the_same_motion():
     assert np.ptp(vertical) < 1e-12 * np.abs(vertical).max()  # roundoff ε|q|/h a step
 
 
+@pytest.mark.soak
 def test_near_a_pole_angles_fail_with_a_message_and_charts_do_not():
     """A swing that misses the pole by a hair: in angles θ turns by π within a step."""
     point = lambda q: jnp.concatenate([unit(q[0], q[1]), unit(q[2], q[3])])

@@ -148,6 +148,7 @@ def heisenberg_by_hand(steps: int):
     return np.array([x, y, z], dtype=float)
 
 
+@pytest.mark.soak
 def test_heisenberg_run_of_the_paper(heisenberg):
     """To t = 1000: the end to 1e-6, the discrete energy 112.5 to 5e-11, and (+) = (−)."""
     end = heisenberg_by_hand(HEISENBERG_STEPS)
@@ -242,6 +243,7 @@ def test_saved_momenta(momentum, share):
 
 @pytest.mark.parametrize("base", BASES)
 @pytest.mark.parametrize("rule", RULES)
+@pytest.mark.soak_of("midpoint-midpoint")
 def test_step_equation_is_the_equations(rule, base):
     """Residual, next state and saved arrays at arbitrary points and unknowns, solved or not."""
     equation = dx.make_step_equation(dx.LagrangeDAlembert(rule, base, momentum="mean"), CURVED, Shape(3, 1))
@@ -396,6 +398,7 @@ def test_phase_space_lagrangian_is_the_midpoint_rule():
     np.testing.assert_allclose(sol.q, turn(k), atol=1e-12)
 
 
+@pytest.mark.soak
 def test_four_vortices():
     """[BLM] (13), 300 steps of h = 1: its own two-step recursion, and the number found independently for it."""
     gamma = np.array([1.0, 1.0, -1.0, -1.0])
@@ -423,6 +426,7 @@ def test_four_vortices():
     np.testing.assert_allclose(np.conj(z[2:] - z[:-2]), of_steps[:-1] + of_steps[1:], atol=1e-12)
 
 
+@pytest.mark.soak
 def test_a_lagrangian_made_regular_by_its_constraint():
     """L = ½ v0² − ½ q1² with v1 = a v0: q̈0 = −a² q0, whose left rule is symplectic Euler, solved in closed form."""
     a, h = 2.0, 0.1
@@ -593,6 +597,7 @@ def test_systems_on_a_smaller_manifold_are_refused():
 
 
 @pytest.mark.parametrize("scheme", [dx.PlusLagrangeDirac, dx.MinusLagrangeDirac])
+@pytest.mark.soak_of("PlusLagrangeDirac")
 def test_the_momentum_that_is_saved_can_be_chosen(scheme):
     """The outgoing one is −D1 L_d of the two points ([PY] (54)); what is chosen changes nothing in q, and verify knows it."""
     disk = gallery.get("rolling-disk")

@@ -43,6 +43,7 @@ def by_hand(q, p, steps):
 
 
 @pytest.mark.parametrize("engine", ["native", pytest.param("xla", marks=pytest.mark.soak)])
+@pytest.mark.soak
 def test_the_equations_by_hand(engine):
     sol = dx.simulate(PARTS, LIFT, x=np.concatenate([Q, P]), params=1.0, step=H, steps=30, engine=engine)
     np.testing.assert_allclose(sol.x[:-1], by_hand(Q, P, 30), atol=1e-12)
@@ -50,6 +51,7 @@ def test_the_equations_by_hand(engine):
     assert report.ok and report["discretization-map Dirac structure"].verdict == "ok"
 
 
+@pytest.mark.soak
 def test_the_lagrangian_scheme_and_the_same_system_as_a_hamilton_dirac():
     lagrangian = lambda q, v: v @ MASS @ v / 2 - jnp.cos(q[0]) - q[1] ** 2 / 2
     run = {"q": Q, "p": P, "step": H, "steps": 30}

@@ -77,6 +77,7 @@ def test_both_engines_agree_on_the_sphere():
 
 
 @pytest.mark.parametrize("engine", ["native", pytest.param("xla", marks=pytest.mark.soak)])
+@pytest.mark.soak
 def test_derivatives_turn_with_the_tangent_space(engine):
     """The chart of a step depends on the plane that it is made on: with a fixed one every step but the first was wrong, the
     derivative by g after 60 steps −.067 for −.0605."""

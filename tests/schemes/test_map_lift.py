@@ -78,6 +78,7 @@ def tied_pendulum():
 @pytest.mark.parametrize("theta", [0.5, 0.3])
 @pytest.mark.parametrize("constraints", METHODS)
 @pytest.mark.parametrize("case", [moving_edge, tied_pendulum])
+@pytest.mark.soak_of(but=["moving_edge-resolve-0.3"])
 def test_a_theta_map_of_ones_own_is_the_theta_map(case, constraints, theta):
     system, data = case()
     run = {**data, "project": True, "step": 0.05, "steps": 30}
@@ -90,6 +91,7 @@ def test_a_theta_map_of_ones_own_is_the_theta_map(case, constraints, theta):
         assert np.abs(own.constraint_residual()).max() < 1e-13
 
 
+@pytest.mark.soak
 def test_the_lift_of_a_nonlinear_map_is_symplectic_and_of_second_order():
     """JᵀΩJ = Ω for a step far from small, and the order in q and p against DOP853."""
     mass = lambda q: jnp.array([[1.0 + q[1] ** 2, 0.3], [0.3, 2.0]])
@@ -176,6 +178,7 @@ def suslov_motion():
         pytest.param(dx.RiemannianExp(SO3), "resolve", marks=pytest.mark.soak),
     ],
 )
+@pytest.mark.soak
 def test_suslovs_problem_on_the_group_against_eulers_equations(map, constraints):
     g, omega = suslov_start()
     exact, errors = suslov_motion(), []
@@ -242,6 +245,7 @@ def ball_ode(t, y, spin):
 
 
 @pytest.mark.parametrize("constraints", METHODS)
+@pytest.mark.soak
 def test_a_ball_rolls_on_a_sphere(constraints):
     """By a product map; the redundant third row of the constraint is found and left out."""
     n, rate, spin = np.array([0.6, 0.0, 0.8]), np.array([0.4, 0.5, -0.3]), 2.0

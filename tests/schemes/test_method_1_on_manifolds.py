@@ -80,6 +80,7 @@ def off_span(covector, span):
         *(pytest.param("one-form", map, marks=pytest.mark.soak) for map in MAPS),
     ],
 )
+@pytest.mark.soak_of("holonomic-projection")
 def test_momenta_and_impulses_have_the_order_of_q(case, map):
     """What is off the constraints in p changes its sign in every plain step, and stayed of order 2."""
     system = dx.ManifoldLagrangian(lagrangian, S2_R, rows, **CASES[case])

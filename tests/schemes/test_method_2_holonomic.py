@@ -35,6 +35,7 @@ def pendulum_errors(system, scheme, steps, time=2.0, **more):
     return [np.max(np.abs(one - other)) for one, other in zip(found, exact, strict=True)], sol
 
 
+@pytest.mark.soak
 def test_orders_of_q_p_and_the_tension_and_the_size_of_the_constraints():
     errors = []
     for steps in (50, 100, 200):
@@ -183,6 +184,7 @@ def both_kinds(gamma, build):
         lambda **c: dx.NonholonomicMechanics(lambda q: jnp.eye(4), lambda q: 0.0 * q[0], **c),
     ],
 )
+@pytest.mark.soak_of("<lambda>1")
 def test_both_kinds_of_constraints_and_a_drag(build):
     errors, gamma = [], 0.3
     for steps in (50, 100, 200):
@@ -233,6 +235,7 @@ def test_wrong_statements():
         dx.simulate(SPHERICAL, METHOD_2, q0=Y0, q1=Y0, step=0.1, steps=1, check_initial=False)
 
 
+@pytest.mark.soak
 def test_accelerations_in_place_and_as_unknowns(monkeypatch):
     """Where there are few, λ and the direction of the first half are solved for in place: the same step."""
 

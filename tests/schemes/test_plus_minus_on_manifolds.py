@@ -39,6 +39,7 @@ def of_middle(q0, q1, h):
 @pytest.mark.parametrize(
     ("name", "engine"), [("free", "native"), ("tied", "native"), pytest.param("tied", "xla", marks=pytest.mark.soak)]
 )
+@pytest.mark.soak_of("tied-native")
 def test_a_users_discrete_lagrangian_beside_the_form_constrained_in_flat_space(name, engine):
     """D2 L_d + D1 L_d + λ q + μ W = 0 with |q| = 1 in R^N are the same equations."""
     tied = name == "tied"
@@ -94,6 +95,7 @@ def test_the_plus_and_minus_equations_without_charts(constraint):
         ("tied", SCHEMES["left"], "native"),
     ],
 )
+@pytest.mark.soak
 def test_what_verify_measures(name, scheme, engine):
     sol = dx.simulate(FREE if name == "free" else TIED, scheme(), **FROM[name], step=H, steps=20, engine=engine)
     report = dx.verify(sol)
@@ -166,6 +168,7 @@ SUSLOV = dx.ManifoldLagrangian(
     ],
     ids=["free body (+)", "Suslov (+)", "Suslov (−)"],
 )
+@pytest.mark.soak
 def test_on_a_group_left_invariant_systems_are_reduced_to_its_algebra(system, scheme):
     """L(g, gξ) = l(ξ) makes l_d(ζ) = h l(ζ/h) with ζ = log(g0⁻¹ g1) of every rule, and A ζ = 0 of every constraint."""
     xi = np.array([0.5, 1.0, -0.3])
@@ -184,6 +187,7 @@ def test_on_a_group_left_invariant_systems_are_reduced_to_its_algebra(system, sc
         assert np.ptp(spatial, axis=0).max() < 3e-13  # roundoff of a step is ε/h of them
 
 
+@pytest.mark.soak
 def test_the_midpoint_equations_are_those_of_the_geodesic_map_in_another_atlas():
     run = FROM["tied"] | {"step": H, "steps": 20}
     known = dx.simulate(TIED, dx.LagrangeDAlembert(), **run)
@@ -241,6 +245,7 @@ def test_on_a_flat_manifold_a_connection_reduces_at_once():
     assert np.ptp(reduced.mu) == 0.0
 
 
+@pytest.mark.soak
 def test_forces_and_their_work():
     """A damped pendulum: the energy lost is the work of the forces, to the second order of the midpoint rule."""
     damped = dx.ManifoldLagrangian(L, SPHERE, forces=lambda t, q, v: -0.5 * v)

@@ -37,6 +37,7 @@ STIFF = {
 
 
 @pytest.mark.parametrize("name", ["accelerations", "ports", pytest.param("rates of a mass matrix", marks=pytest.mark.soak)])
+@pytest.mark.soak
 def test_where_the_fixed_point_does_not_converge_newton_goes_on_with_systems_of_one_node(name):
     system, data, more, step, stages = STIFF[name]
     run = lambda engine, data: dx.simulate(system, dx.Collocation(stages), step=step, steps=30, engine=engine, **data, **more)
@@ -64,6 +65,7 @@ HARDLY = {
 
 
 @pytest.mark.parametrize("name", HARDLY)
+@pytest.mark.soak_of("fixed point of means")
 def test_a_step_is_not_left_where_its_changes_stop_to_shrink(name):
     """The iteration goes to and fro at 1e-10 of the stiff forces, far above their roundoff; another one goes on then."""
     scheme, q, v, k, hk, most = HARDLY[name]
@@ -80,6 +82,7 @@ SHORT = {
 
 
 @pytest.mark.parametrize("name", SHORT)
+@pytest.mark.soak_of("energy given back at low speed")
 def test_short_steps_of_stiff_springs_are_no_false_alarm(name):
     scheme, q, v, k, hk = SHORT[name]
     report = dx.verify(dx.simulate(CHAIN, scheme, q=q, v=v, step=hk / k, steps=60, params=k))

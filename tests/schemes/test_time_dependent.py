@@ -124,6 +124,7 @@ HEADING = dx.LagrangeDirac(lambda q, v: v @ v / 2, lambda t, q: jnp.stack([jnp.s
         (dx.DiscreteDirac(constraints="resolve"), 2, 2),
     ],
 )
+@pytest.mark.soak_of("scheme0-2-2")
 def test_a_particle_with_a_prescribed_heading_goes_round_a_circle(scheme, order, of_p):
     """sin t dx − cos t dy = 0: the speed is constant, q = (sin t, 1 − cos t), and the force is that of the turn, 1."""
     errors = []
@@ -177,6 +178,7 @@ VELOCITY = np.array([0.2, 0.7, SPIN * 0.5 - 0.7, 0.2 + SPIN * -0.3])
         (dx.DiscreteDirac(constraints="resolve"), 2),
     ],
 )
+@pytest.mark.soak_of("scheme0-2")
 def test_a_ball_on_a_turntable_goes_round_with_two_sevenths_of_its_frequency(scheme, order):
     """z̈ = (2/7)iΩż for z = x + iy: a circle, from any velocity (Earnshaw; Neimark, Fufaev)."""
     rate, z0, u0 = 2 * SPIN / 7, CENTRE[0] + 1j * CENTRE[1], VELOCITY[0] + 1j * VELOCITY[1]
@@ -211,6 +213,7 @@ def test_the_gallery_has_it_in_euler_angles():
     assert np.max(np.abs(sol.constraint)) < 1e-14
 
 
+@pytest.mark.soak
 def test_projection_onto_affine_constraints_and_engines():
     sol = dx.simulate(
         TURNTABLE, dx.LagrangeDAlembert(), q=CENTRE, v=[1.0, 0.0, 0.0, 0.0], params=SPIN, step=0.1, steps=30, project=True

@@ -67,6 +67,7 @@ def test_energy_does_not_drift_over_a_hundred_thousand_orbits():
     assert long.t[-1] > 1e5 * PERIOD and band < 1e-6 and moved < 0.02 * band
 
 
+@pytest.mark.soak
 def test_run_back_returns_to_the_start(sol):
     steps = StepsInNumbers.of(sol.equation, sol.given_params, False)
     params, state = np.ones((1, 1)), np.concatenate([Q, V, [density(Q)], [0.0]])[None]
@@ -151,6 +152,7 @@ def test_derivatives(engine):
     assert abs(jax.grad(end)(0.8) - by_differences) < 1e-8 * abs(by_differences)
 
 
+@pytest.mark.soak
 def test_the_local_frequency_is_the_density_of_kepler():
     own = dx.simulate(EXAMPLE.system, dx.VariableSteps(dx.Collocation(2)), step=0.1 * 5**0.25, steps=60, **RUN)
     given = dx.simulate(EXAMPLE.system, dx.VariableSteps(dx.Collocation(2), density), step=0.1, steps=60, **RUN)
@@ -184,6 +186,7 @@ def of_points(x):
         ),
     ],
 )
+@pytest.mark.soak_of("system0-start0")
 def test_steps_of_a_two_form_run_natively_and_are_checked(system, start):
     sol = dx.simulate(system, dx.VariableSteps(dx.DiscreteDirac(), of_points), **start, step=0.05, steps=40)
     assert sol.stats["engine"] == "native"
@@ -288,6 +291,7 @@ SCHEME_OF_LOCAL_FREQUENCY = dx.VariableSteps(dx.Collocation(2))
 
 
 @pytest.mark.parametrize("scheme", [dx.LagrangeDAlembert(), dx.Collocation(2, nodes="lobatto")])
+@pytest.mark.soak
 def test_impulses_over_the_lengths_of_their_steps_are_means_of_the_force(scheme):
     """The tension of a pendulum, of second order as the mean of the step, of first as the value at the row."""
     pendulum = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[1], holonomic=lambda q: jnp.array([(q @ q - 1.0) / 2]))

@@ -23,6 +23,7 @@ def read(arrays: Arrays, record: dict) -> np.ndarray:
 
 
 @given(st.lists(st.lists(finite, min_size=1, max_size=20), min_size=1, max_size=4), st.sampled_from(sorted(KINDS)))
+@pytest.mark.soak
 def test_every_bit_comes_back(vectors, kind):
     arrays = Arrays()
     given = [np.array(v).astype(KINDS[kind]) if kind[0] == "f" else np.arange(len(v)).astype(KINDS[kind])[::-1] for v in vectors]

@@ -1,6 +1,7 @@
 """Rotations as quaternions."""
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -18,6 +19,7 @@ def test_a_turn_is_right_handed():
 
 
 @given(angles, angles, angles)
+@pytest.mark.soak
 def test_turns_multiply_as_matrices_do_and_come_back_from_them(a, b, c):
     parts = [turn([0, 0, 1], a), turn([1, 0, 0], b), turn([0, 1, 1], c)]
     whole = np.asarray(after(*parts))

@@ -31,6 +31,7 @@ def exact():
     ],
     ids=repr,
 )
+@pytest.mark.soak_of("Collocation(stages=2, nodes='gauss')-3")
 def test_the_order_between_rows(scheme, order, exact):
     errors = []
     for steps in (10, 20, 40):
@@ -57,6 +58,13 @@ CONSTRAINED = {
     ("scheme", "order"),
     [(dx.EnergyCollocation(2), 3), (dx.EnergyCollocation(3), 4), (dx.Collocation(3, nodes="lobatto"), 3)],
     ids=lambda value: repr(value),
+)
+@pytest.mark.soak_of(
+    but=[
+        "EnergyCollocation(stages=2, points=8, frame=None)-3-0.0",
+        "Collocation(stages=3, nodes='lobatto')-3-0.0",
+        "Collocation(stages=3, nodes='lobatto')-3-0.2",
+    ]
 )
 def test_the_order_between_rows_with_one_forms(scheme, order, affine):
     """A blade in a wind: v = u e − b n with e = (cos φ, sin φ), n = (sin φ, −cos φ), φ̇ = ω and u̇ = bω − cos φ."""
@@ -131,6 +139,7 @@ def test_thinned_rows_and_batches_have_what_single_runs_with_every_row_have():
 
 
 @pytest.mark.parametrize("scheme", [dx.Collocation(2), dx.LagrangeDAlembert()], ids=lambda s: type(s).__name__)
+@pytest.mark.soak
 def test_derivatives_go_through_it(scheme):
     run = lambda x: dx.simulate(HENON.system, scheme, q=jnp.stack([x, 0.1]), v=jnp.array([0.3, 0.2]), step=0.1, steps=4)
     slope = jax.jit(jax.grad(lambda x: run(x).at(0.237).q[1]))(0.05)
@@ -162,6 +171,7 @@ def test_an_engine_without_scalar_programs_is_not_asked_for_them():
 
 
 @pytest.mark.parametrize("scheme", [dx.LagrangeDAlembert(), dx.Composition(dx.LagrangeDAlembert(), "suzuki4")], ids=repr)
+@pytest.mark.soak
 def test_rows_that_were_not_saved(scheme):
     """They are those of the run, far from saved ones too, and momenta between them have the order of the scheme: half of the
     impulse of the constraints is that of a step of one length before and after."""
@@ -178,6 +188,7 @@ def test_rows_that_were_not_saved(scheme):
     assert np.log2(errors[0] / errors[2]) / 2 > order - 0.25, errors
 
 
+@pytest.mark.soak
 def test_rows_on_manifolds_are_the_runs_own():
     """The polynomial of the momenta meets those of the rows up to its order alone."""
     sol = gallery.get("spherical-pendulums").simulate(dx.Collocation(2), steps=12, save_every=3)
@@ -186,6 +197,7 @@ def test_rows_on_manifolds_are_the_runs_own():
 
 
 @pytest.mark.parametrize("scheme", [dx.LagrangeDAlembert(), dx.Composition(dx.LagrangeDAlembert())])
+@pytest.mark.soak_of("scheme0")
 def test_momenta_just_after_a_row_have_their_digits(scheme):
     """A step so short has lost its impulses in rounding: p was off by 2e-3 there."""
     sphere = dx.ManifoldLagrangian(lambda q, v: v @ v / 2 - q[2], dx.Sphere(3))

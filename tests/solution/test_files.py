@@ -436,6 +436,7 @@ def one_sentence(path, **arguments) -> str:
     return text
 
 
+@pytest.mark.soak
 def test_foreign_files(tmp_path):
     xr.Dataset({"a": ("x", np.zeros(3))}).to_netcdf(tmp_path / "other.nc", engine="h5netcdf")
     assert "holds no dirax solution" in one_sentence(tmp_path / "other.nc")
@@ -684,6 +685,7 @@ def test_files_of_the_first_version(ending, tmp_path):
 
 
 @pytest.mark.parametrize("sealed", [False, True])
+@pytest.mark.soak_of("True")
 def test_a_netcdf_file_in_circles_is_refused(tmp_path, monkeypatch, sealed):
     """A list of free places that goes on at itself, in a file without a checksum or with the right one: the HDF5 library never
     ends."""

@@ -82,6 +82,7 @@ def examine(sol, path, count, seed, monkeypatch):
 
 @pytest.mark.parametrize("count", [40, pytest.param(50_000, marks=pytest.mark.soak)])
 @pytest.mark.parametrize("ending", [".zarr", ".nc"])
+@pytest.mark.soak
 def test_mutated_files_are_refused_or_hold_what_they_held(ending, count, saved, tmp_path, monkeypatch):
     path = saved.save(tmp_path / f"run{ending}")
     assert examine(saved, path, count, len(ending), monkeypatch) > count // 2

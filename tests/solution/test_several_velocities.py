@@ -31,6 +31,7 @@ def motion():
         (dx.Composition(dx.LagrangeDAlembert(), "kahan-li6"), 1e-9, 1e-8),
     ],
 )
+@pytest.mark.soak_of("scheme2-1e-09-1e-08")
 def test_energies_and_places_between_rows(motion, scheme, of_energy, of_q):
     sol = dx.simulate(dx.LagrangeDirac(lagrangian), scheme, **START, step=0.01, steps=60)
     np.testing.assert_allclose(sol.energy(), ENERGY, atol=of_energy)
@@ -55,6 +56,7 @@ def test_rows_of_a_batch_are_those_of_one():
     assert np.array_equal(two.energy()[1], one.energy())
 
 
+@pytest.mark.soak
 def test_the_parameters_of_a_morse_family_are_those_of_the_steps():
     structure = dx.induced_dirac(lambda q: jnp.zeros((0, 1)), 1)
     system = dx.GeneralizedDiracSystem(structure, dx.LagrangianSubmanifold.from_lagrangian(lagrangian, 1))
@@ -88,6 +90,7 @@ def test_on_a_quotient():
 
 
 @pytest.mark.parametrize("every", [1, 7])
+@pytest.mark.soak_of("1")
 def test_beside_a_wall_that_turns_the_velocity(every):
     wall = dx.Impact(lambda q: 0.5 - q[0])
     data = {**START, "step": 0.01, "steps": 70, "save_every": every, "events": wall}

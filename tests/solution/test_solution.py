@@ -84,6 +84,7 @@ def test_constraint_residual_is_that_of_the_steps(skate):
     assert skate.constraint_residual() is skate.constraint
 
 
+@pytest.mark.soak
 def test_energy_inside_a_gradient():
     """∂E/∂k of the last row, E = p²/2m + k q²/2, by the recursion written out."""
 
@@ -207,6 +208,7 @@ def on_a_circle(q):
 
 
 @pytest.mark.parametrize("batch", [False, True])
+@pytest.mark.soak_of("False")
 def test_solutions_are_pickled_and_copied_in_depth(batch):
     q = np.array([[0.6, 0.8], [0.0, 1.0]])[: 2 if batch else 1]
     given = {"q": q if batch else q[0], "v": np.zeros_like(q) if batch else np.zeros(2), "params": {"g": 9.8}}

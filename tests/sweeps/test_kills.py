@@ -99,11 +99,13 @@ def test_the_caller_is_killed(tmp_path, uninterrupted, started):
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="processes are found in /proc")
+@pytest.mark.soak
 def test_a_worker_is_killed(tmp_path, uninterrupted, started):
     kill_workers(tmp_path, uninterrupted, started, (1, 6))
 
 
 @pytest.mark.skipif(find_spec("distributed") is None, reason="dask.distributed is not installed: pip install dirax[dask]")
+@pytest.mark.soak
 def test_a_scheduler_and_its_workers_are_killed(tmp_path, uninterrupted, started, forked):
     kill_schedulers(tmp_path, uninterrupted, started, forked, (1, 6))
 
@@ -139,6 +141,7 @@ def kill_schedulers(tmp_path, uninterrupted, started, forked, moments):
     finished(path, uninterrupted)
 
 
+@pytest.mark.soak
 def test_ctrl_c_ends_cleanly_and_says_how_to_go_on(tmp_path, uninterrupted, started):
     path = tmp_path / "study.zarr"
     process = started(path, "here")

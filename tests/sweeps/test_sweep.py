@@ -51,6 +51,7 @@ def ran(monkeypatch):
 # ------------------------------------------------------------------ what comes out
 
 
+@pytest.mark.soak
 def test_every_point_has_the_bits_of_a_run_by_itself(done):
     data, _ = done
     assert dict(data.sizes) == {"g": 12, "angle": 20, "time": 5, "coordinate": 2}
@@ -75,6 +76,7 @@ def test_rows_of_constraints_have_the_name_that_files_give_them(tmp_path):
     assert np.array_equal(data.multipliers.values[1], sol.multipliers)
 
 
+@pytest.mark.soak
 def test_any_zarr_library_opens_the_store_and_so_does_load(done):
     data, path = done
     assert same(data, xr.open_zarr(path, consolidated=None)) and same(data, dx.load(path))
@@ -82,6 +84,7 @@ def test_any_zarr_library_opens_the_store_and_so_does_load(done):
 
 
 @pytest.mark.parametrize("changes", [{"task_seconds": 1e-6}, {"task_seconds": 10.0}, {"executor": ThreadPoolExecutor(2)}])
+@pytest.mark.soak_of("changes0")
 def test_bits_do_not_depend_on_the_size_of_tasks_or_where_they_run(done, tmp_path, changes):
     assert same(done[0], study(tmp_path / "other.zarr", **changes))
 
@@ -171,6 +174,7 @@ def test_a_system_of_the_xla_engine_one_batch_a_device(tmp_path):
     )
 
 
+@pytest.mark.soak
 def test_processes_of_jax_distributed_share_the_tasks_of_one_store(done, tmp_path, forked, monkeypatch):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -212,6 +216,7 @@ def test_slurm_is_asked_for_workers_by_a_script_and_its_cluster_is_an_executor()
 # ------------------------------------------------------------------ going on, growing
 
 
+@pytest.mark.soak
 def test_the_same_call_again_runs_what_is_missing(done, tmp_path, ran):
     path = tmp_path / "study.zarr"
     study(path)
@@ -452,6 +457,7 @@ def test_a_wrong_case_names_the_point(tmp_path):
         lambda sample, key: {"q": jax.random.normal(key, (2,)), "v": [0.0, 0.0], "params": {"g": 1.0}},
     ],
 )
+@pytest.mark.soak_of(but=["<lambda>2"])
 def test_random_numbers_belong_to_the_point(tmp_path, function):
     some = study(tmp_path / "some.zarr", {"sample": range(0, 40, 3)}, case=function, steps=5)
     more = study(tmp_path / "more.zarr", {"sample": range(40)}, case=function, steps=5, task_seconds=1.0)
@@ -494,6 +500,7 @@ TANK = dx.LagrangeDirac(lambda q, v: 1e-9 * v @ v / 2 - q @ q / 2e-12)
 @pytest.mark.parametrize("scale", [2.0**-50, 1.0])
 @pytest.mark.parametrize("points", [2, 6, 64])
 @pytest.mark.parametrize("rows", [2, 6, 7])
+@pytest.mark.soak_of("2-64-1.0")
 def test_no_axis_is_taken_for_that_of_the_points_whatever_the_units(tmp_path, scale, points, rows):
     charges = np.linspace(1.0, 3.0, points)
 
@@ -557,6 +564,7 @@ def test_numbers_of_several_types_are_kept_and_given_in_one_that_has_them_all(tm
         assert np.array_equal(data.q.values[0, j], single([1.0, 1.5][j > 0], angles[j]).q)
 
 
+@pytest.mark.soak
 def test_a_store_that_grows_keeps_the_types_of_its_numbers(tmp_path):
     path = tmp_path / "grown.zarr"
     kept = lambda sol: {"x": sol.q[0, 0] if sol.q[0, 0] < 1.0 else 0}

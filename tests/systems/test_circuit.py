@@ -14,6 +14,7 @@ MIDPOINT = dx.DiscreteDirac()
 DIODE = ("R", 1, 2, lambda u: 0.1 * jnp.expm1(5.0 * u))
 
 
+@pytest.mark.soak
 def test_a_transformer_transforms_an_inductor():
     """A capacitor sees n²L through a transformer: ω = 1/√(n² L C)."""
     system = dx.circuit([("C", 1, 0, 2.0), ("T", (1, 0), (2, 0), 3.0), ("L", 2, 0, 0.5)])
@@ -43,6 +44,7 @@ def test_a_diode_discharges_a_capacitor_as_it_should():
 
 
 @pytest.mark.parametrize("engine", ["native", "xla"])
+@pytest.mark.soak_of("xla")
 def test_the_books_of_a_rectifier_close(engine):
     """The midpoint rule keeps a quadratic energy but for what sources and resistors exchange, to roundoff."""
     netlist = [("V", 1, 0, lambda t: jnp.sin(t)), DIODE, ("C", 2, 0, 2.0), ("L", 2, 3, 1.0), ("R", 3, 0, 5.0)]
@@ -222,6 +224,7 @@ def test_functions_are_user_functions():
 
 
 @pytest.mark.parametrize("nodes", [3, 140])
+@pytest.mark.soak_of("140")
 def test_the_laws_of_few_and_of_many_nodes(nodes):
     """By their residual, written out: a chain of C to the ground and L between nodes, with a source and a transformer."""
     chain = [element for n in range(1, nodes) for element in (("C", n, 0, 1.0 + n), ("L", n, n + 1, 2.0))]
@@ -242,6 +245,7 @@ def test_the_laws_of_few_and_of_many_nodes(nodes):
 
 @pytest.mark.parametrize("t0", [0.0, 0.4])
 @pytest.mark.parametrize("source", [0.5, lambda t: 0.5 * jnp.cos(t)], ids=["constant", "in time"])
+@pytest.mark.soak_of(but=["constant-0.4"])
 def test_the_advice_for_a_start_off_the_laws_works_as_written(source, t0):
     """A source beside a capacitor, which the initial charge contradicts."""
     system, x = dx.circuit([("V", 1, 0, source), ("C", 1, 0, 2.0), ("R", 1, 2, 1.0), ("C", 2, 0, 3.0)]), np.array([0.0, 0.6])
@@ -320,6 +324,7 @@ def test_a_nonlinear_resistor_has_no_chain():
     ],
     ids=["open", "star with an open branch", "inductors alone"],
 )
+@pytest.mark.soak
 def test_a_current_that_is_zero_has_the_size_that_it_could_have(netlist, near):
     """Its equation has one term, which is the roundoff of zero: points that the constraint algorithm had found were refused, with
     residuals of 1e-15, and right runs called VIOLATED."""

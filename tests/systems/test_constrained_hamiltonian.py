@@ -44,6 +44,7 @@ def pendulum_errors(scheme, steps):
     return [np.max(np.abs(found - known)) for found, known in parts], sol
 
 
+@pytest.mark.soak
 def test_orders_of_q_p_and_the_tension_of_method_2():
     errors = []
     for steps in (50, 100, 200):
@@ -53,6 +54,7 @@ def test_orders_of_q_p_and_the_tension_of_method_2():
     assert slopes(errors) == pytest.approx(2.0, abs=0.1)
 
 
+@pytest.mark.soak
 def test_the_multipliers_of_method_1_alternate_and_their_means_are_of_second_order():
     """p̄ is on the hidden constraint, so that the nodes are off it by O(h²), to either side in turn, and λ by O(h)."""
     errors, h = [pendulum_errors(METHOD_1, steps)[0] for steps in (50, 100, 200)], 2.0 / 200
@@ -63,6 +65,7 @@ def test_the_multipliers_of_method_1_alternate_and_their_means_are_of_second_ord
     assert np.all(signs[1:9:2] == -signs[:8:2]) and errors[-1][2] > h * 0.05
 
 
+@pytest.mark.soak
 def test_method_1_is_that_of_the_lagrangian():
     """The same equations in x = (q, p), to roundoff, multipliers included; and q, p as initial data."""
     lagrangian = dx.LagrangeDirac(
@@ -137,6 +140,7 @@ def test_the_chain_finds_the_same_final_manifold_field_and_multipliers():
     np.testing.assert_allclose(chain.multipliers(x), multipliers, atol=1e-12)
 
 
+@pytest.mark.soak
 def test_composition_and_the_exact_energy_of_a_discrete_gradient():
     errors = []
     fine = dx.simulate(FLAT, dx.Composition(METHOD_2, "suzuki4"), x=FLAT_START, step=0.0025, steps=400).x[-1]

@@ -85,6 +85,7 @@ def state_of_the_pendulum(angle, rate, m):
 
 
 @pytest.mark.parametrize("m", [2.0, 0.7])
+@pytest.mark.soak_of("2.0")
 def test_a_tension_that_is_a_coordinate(tension, m):
     """Four levels: p_λ = 0, |q| = 1, q·p = 0, the tension; λ̇ = 3 m ẏ/2 from differentiating that. For other params too."""
     assert (dimensions(tension), tension.index, tension.verdict) == ([5, 4, 3, 2, 2], 4, "determined")
@@ -98,6 +99,7 @@ def test_a_tension_that_is_a_coordinate(tension, m):
     assert tension.constraints(tension.project(away, m), m) == pytest.approx(np.zeros(4), abs=1e-14)
 
 
+@pytest.mark.soak
 def test_engines_agree_on_a_chain_of_four_levels(tension):
     start = state_of_the_pendulum(0.9, 0.4, 2.0)
     run = {"x": start, "params": 2.0, "step": 0.02, "steps": 50}
@@ -161,6 +163,7 @@ def test_an_undetermined_coordinate_is_gauge_freedom():
     assert free / free.max() == pytest.approx([0.0, 1.0, 0.0, 0.0], abs=1e-12)
 
 
+@pytest.mark.soak
 def test_momenta_not_affine_in_velocities_go_to_the_pontryagin_bundle():
     """L = √(1 − v_0²) + q_1 v_0 − q_1²/2: q_1 = v_0 by its own equation, then d/dt of p_0 = q_1 − v_0/√… = 0."""
     system = dx.LagrangeDirac(lambda q, v: jnp.sqrt(1 - v[0] ** 2) + q[1] * v[0] - q[1] ** 2 / 2)
@@ -172,6 +175,7 @@ def test_momenta_not_affine_in_velocities_go_to_the_pontryagin_bundle():
     assert np.asarray(chain.field(chain.point))[[1, 2]] == pytest.approx([0.0, 0.0], abs=1e-12)
 
 
+@pytest.mark.soak
 def test_closed_ports_and_dirac_systems():
     """A mass tied to rest by its closed port has u = −force; the induced structure of a knife edge gives index 1."""
     port = dx.PortHamiltonian(
@@ -218,6 +222,7 @@ def test_what_goes_wrong_is_explained(E, f, near, verdict, words):
         chain.field(np.array(near))
 
 
+@pytest.mark.soak
 def test_secondary_constraints_that_exist_only_on_the_manifold():
     """ẋ_1 + x_1 ẋ_2 = x_0 − x_2 determines ẋ_2 off x_1 = 0; on it, where ẋ_1 = 0, it is the condition x_0 = x_2."""
     system = ImplicitSystem(
@@ -256,6 +261,7 @@ def test_inputs_are_checked():
         constraint_algorithm(ImplicitSystem(lambda x: jnp.eye(2), lambda x: x), np.array([np.nan, 0.0]))
 
 
+@pytest.mark.soak
 def test_functions_of_the_chain_are_traceable_and_differentiable(pendulum):
     x = jnp.asarray(pendulum.point)
     derivative = jax.jit(jax.jacfwd(lambda x: pendulum.project(x)))(x)
@@ -270,6 +276,7 @@ ROLLING = dx.DiracStructure.from_annihilator(lambda x: jnp.stack([-x[1], 0.0, 1.
 
 
 @pytest.mark.parametrize("near", [(0.001, 0.001, 0.001), (0.0, 0.0, 0.1), (0.3, 0.1, 0.2)])
+@pytest.mark.soak_of("near2")
 def test_a_pivot_that_vanishes_on_the_manifold_is_chosen_again(near):
     """dH ∥ (−y, 0, 1) and dH = x: M_0 is x = y = 0, where the entry −y of the one-form is zero."""
     chain = constraint_algorithm(dx.DiracSystem(ROLLING, lambda x: x @ x / 2), near=np.array(near))
@@ -277,6 +284,7 @@ def test_a_pivot_that_vanishes_on_the_manifold_is_chosen_again(near):
     np.testing.assert_allclose(chain.point[:2], 0.0, atol=1e-12)
 
 
+@pytest.mark.soak
 def test_the_point_of_a_chain_is_the_nearest_one():
     """dH = (y, x, z) ∥ (−y, 0, 1): x = 0 with y = 0, .22 away, or with z = −1, .8 away."""
     near = np.array([0.1, 0.2, -0.2])
@@ -307,6 +315,7 @@ def turning(rows):
 
 
 @pytest.mark.parametrize(("near", "engine"), [([1.0, 0.0, 0.0], "native"), ([1.0, 0.0, 0.1], "xla")])
+@pytest.mark.soak
 def test_a_pivot_that_vanishes_along_a_run_is_left_for_another(near, engine):
     """M_f is the cylinder; the pivot cos z of its point is zero at a node of the run, z = π/2."""
     chain = constraint_algorithm(turning([0, 1, 2, 3]), near=np.array(near))
@@ -352,6 +361,7 @@ def crossing(force, unit):
 
 @pytest.mark.parametrize("force", ["potential", "friction", "driven"])
 @pytest.mark.parametrize("unit", [1.0, 2.0**-40])
+@pytest.mark.soak
 def test_a_hessian_that_loses_rank_at_the_point_alone_is_irregular(force, unit):
     """It was taken for one of that rank everywhere: gauge freedom, or a final manifold that is none."""
     found = [
@@ -361,6 +371,7 @@ def test_a_hessian_that_loses_rank_at_the_point_alone_is_irregular(force, unit):
     assert "it is not constant" in found[0].explanation
 
 
+@pytest.mark.soak
 def test_a_hessian_whose_kernel_turns_has_one_rank():
     system = dx.LagrangeDirac(lambda q, v: ((v[0] * jnp.cos(q[2]) + v[1] * jnp.sin(q[2])) ** 2 + v[2] ** 2) / 2)
     for angle in (1e-8, 0.7):

@@ -43,6 +43,7 @@ def test_the_graph_of_dh_is_the_dirac_system():
 
 
 @pytest.mark.parametrize("map", [dx.Midpoint(), dx.cotangent_lift(dx.Theta(0.25))])
+@pytest.mark.soak
 def test_dl_is_the_lagrangian_system(map):
     """With a quartic kinetic energy, whose Legendre transform has no formula; p, energy, and s = Δq/h at the base point."""
     system = dx.GeneralizedDiracSystem(CANONICAL, from_lagrangian(driven, 3))
@@ -54,6 +55,7 @@ def test_dl_is_the_lagrangian_system(map):
     assert dx.verify(ours)["discretization-map Dirac structure"].verdict == "ok"
 
 
+@pytest.mark.soak
 def test_constraints_are_those_of_the_dirac_structure():
     row = np.asarray(FORMS(Q))[0]
     v = V - row * (row @ V) / (row @ row)
@@ -62,6 +64,7 @@ def test_constraints_are_those_of_the_dirac_structure():
     np.testing.assert_allclose(ours.x, np.concatenate([theirs.q, theirs.p], axis=1), atol=1e-12)
 
 
+@pytest.mark.soak
 def test_a_singular_lagrangian():
     """L = ⟨α(q), q̇⟩ − H(q), α not linear: Method 1 of [BLM] §6 from p = α(q), and the chain of (x, s)."""
     alpha = lambda q: jnp.array([-jnp.sin(q[1]), q[0] + q[0] ** 3 / 3])
@@ -186,6 +189,7 @@ def test_method_1_of_a_constrained_family_warns_that_its_index_is_three():
         assert "final manifold" not in of(dx.verify(falling))
 
 
+@pytest.mark.soak
 def test_the_motion_of_constraints_of_any_index_is_a_reference():
     """That of the constraint algorithm: of index 3 Method 1 comes to something else, which its own refinement does not show; of a
     closed port it comes to the motion of the reduced circuit."""

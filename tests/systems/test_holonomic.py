@@ -125,6 +125,7 @@ MOVING = dx.LagrangeDirac(
 )
 
 
+@pytest.mark.soak
 def test_a_moving_pivot():
     """x²-pivot at 0.3 cos 2t: g depends on time, and v satisfies G v + ∂g/∂t = 0."""
     field = lambda t, y: [y[1], -np.sin(y[0]) + 1.2 * np.cos(2 * t) * np.cos(y[0])]
@@ -202,6 +203,7 @@ def test_a_double_pendulum_in_cartesian_coordinates():
     assert slopes(errors) == pytest.approx(2.0, abs=0.15)
 
 
+@pytest.mark.soak
 def test_constraints_stay_at_roundoff_and_the_energy_bounded_over_many_steps():
     sol = dx.simulate(DOUBLE, MIDPOINT, step=0.01, steps=100_000, save_every=10, engine="native", **DOUBLE_START)
     assert sol.ok and np.max(np.abs(sol.constraint)) < 1e-14
@@ -213,6 +215,7 @@ def test_constraints_stay_at_roundoff_and_the_energy_bounded_over_many_steps():
 
 
 @pytest.mark.parametrize("scheme", [MIDPOINT, pytest.param(dx.PlusLagrangeDirac("left"), marks=pytest.mark.soak)])
+@pytest.mark.soak
 def test_the_two_form_of_the_constraint_manifold_is_preserved(scheme):
     """Pulled back to angles and rates, dq ∧ dp before and after a step are the same two-form."""
     inside = lambda y: cartesian(y, jnp)
@@ -229,6 +232,7 @@ def test_the_two_form_of_the_constraint_manifold_is_preserved(scheme):
     assert np.max(np.abs(later - before)) > 0.05
 
 
+@pytest.mark.soak
 def test_engines_and_batches_agree():
     run = {"step": 0.02, "steps": 50}
     batch = {name: np.stack([DOUBLE_START[name], DOUBLE_START[name] * sign]) for name, sign in (("q", 1.0), ("v", -0.5))}
@@ -239,6 +243,7 @@ def test_engines_and_batches_agree():
     np.testing.assert_array_equal(alone.q, native.q[0])
 
 
+@pytest.mark.soak
 def test_a_gradient_against_finite_differences():
     def end(turn):
         angle = 1.0 + turn
@@ -251,6 +256,7 @@ def test_a_gradient_against_finite_differences():
 
 
 @pytest.mark.parametrize("scheme", [MIDPOINT, dx.PlusLagrangeDirac("left"), dx.MinusLagrangeDirac("left")])
+@pytest.mark.soak
 def test_verify_finds_the_discrete_dirac_structure_of_the_constraint_distribution(scheme):
     sol = dx.simulate(PENDULUM, scheme, step=0.02, steps=100, **START)
     report = verify(sol)
@@ -285,6 +291,7 @@ MIXED = dx.LagrangeDirac(
 )
 
 
+@pytest.mark.soak
 def test_both_kinds_of_constraints():
     """x² + y² = 1 and dz = y ds, free otherwise: θ = ωt, ṡ = ṡ0/√(1 + sin²θ)."""
     errors = []
@@ -361,6 +368,7 @@ def test_redundant_constraints_in_a_batch_and_projected():
     assert moved.ok and np.max(np.abs(bars(jnp.asarray(moved.q[0])))) < 1e-14
 
 
+@pytest.mark.soak
 def test_a_one_form_that_says_what_a_constraint_says_is_left_out():
     """On the surface z = x²/2 the one-form dz − x dx follows from the constraint, which holds the position too and stays."""
     on = lambda q: jnp.stack([q[2] - q[0] ** 2 / 2])
@@ -383,6 +391,7 @@ def test_a_singular_configuration_is_not_redundancy():
 @pytest.mark.parametrize(
     "scheme", [MIDPOINT, dx.PlusLagrangeDirac(), dx.DiscreteDirac(), dx.DiscreteDirac(constraints="resolve")]
 )
+@pytest.mark.soak_of("scheme0", "scheme3")
 def test_dependent_one_forms_go_on_with_the_independent_ones(scheme):
     edge = lambda q: jnp.stack([jnp.sin(q[2]), -jnp.cos(q[2]), 0.0 * q[0]])
     one, twice = lambda q: edge(q)[None], lambda q: jnp.stack([edge(q), -3.0 * edge(q)])
@@ -397,6 +406,7 @@ def test_dependent_one_forms_go_on_with_the_independent_ones(scheme):
         assert double.stats["redundant_constraints"] == [1] and "redundant_constraints" not in single.stats
 
 
+@pytest.mark.soak
 def test_constraints_that_contradict_each_other():
     L = lambda q, v: v @ v / 2
     given = {"q": [0.0, 0.0, 0.0], "v": [1.0, 0.0, 0.0], "step": 0.1, "steps": 3}

@@ -15,6 +15,7 @@ def dimensions(chain):
     return [level.dimension for level in chain.levels]
 
 
+@pytest.mark.soak
 def test_forces_enter_the_field_and_the_multipliers():
     """f = c(v_y, −v_x) − γv on |q| = 1: 2λ = y − |v|² − q·f keeps q·q̈ = −|v|²."""
     c, gamma = 0.7, 0.2

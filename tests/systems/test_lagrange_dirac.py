@@ -135,6 +135,7 @@ def test_without_a_root_the_last_improvement_comes_back():
 
 @settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1), st.integers(2, 3), st.integers(2, 3), st.integers(0, 3))
+@pytest.mark.soak
 def test_pseudo_inverse_and_rank_of_badly_scaled_matrices(seed, k, l, rank):
     generator = np.random.default_rng(seed)
     rank = min(rank, k, l)

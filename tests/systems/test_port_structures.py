@@ -89,6 +89,7 @@ def onto(x):
 METHOD_2 = dx.DiscreteDirac(dx.ProjectedMap(dx.Midpoint(), onto, 5), constraints="resolve")
 
 
+@pytest.mark.soak
 def test_a_projector_on_the_closed_port():
     """Against R_d^{M0} inverted by SciPy at every step, with ẋ = J dH + Bu at its base point; and Method 2 of [BLM] §8.1."""
     h = 0.05

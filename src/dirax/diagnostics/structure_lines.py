@@ -34,7 +34,7 @@ decomposition of a matrix or a Fourier transform in them, which round by several
 
 LEFT_OUT = (
     "; only the constraints that were left out are missed: they follow from the others where all holonomic ones hold, and the "
-    "rows of this scheme are off that"
+    "places at which this scheme takes them are off that"
 )
 WORDS = {2: "two", 3: "three"}
 

@@ -11,7 +11,7 @@ FAR = 2.0**-20
 CLEAR = 64 * EPSILON
 """Changes above it, relative to the terms of an iterate, are more than their roundoff."""
 
-SURE = 2.0**-10
+SURE = 2.0**-6
 """What is likely roundoff of a size, which is a bound that can be far too large: changes clear of it are looked at again."""
 
 PATIENCE = 3.0
