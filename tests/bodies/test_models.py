@@ -382,3 +382,14 @@ def test_wheels_are_drawn_across_their_axes(axis):
     np.testing.assert_allclose(turn @ [0.0, 0.0, 1.0], axis, atol=1e-9)
     np.testing.assert_allclose(turn.T @ turn, np.eye(3), atol=1e-9)
     assert np.linalg.det(turn) == pytest.approx(1.0)
+
+
+def test_a_carriage_without_mass_has_no_accelerations_of_its_own():
+    """Between two springs: accelerations of least squares were returned, −.375 for −.1875 and −.5625, and ω = 1 for √¾."""
+    springs = [b.Spring(3.0, coordinate="light"), b.Spring(1.0, coordinate="m")]
+    joints = [b.prismatic("ground", "light"), b.prismatic("light", "m")]
+    model = b.Model([b.Body("light", 0.0), b.Body("m", 1.0)], joints, forces=springs, gravity=(0, 0, 0))
+    with pytest.raises(ValueError, match=r"do not determine the accelerations: .* no mass"):
+        model.accelerations(**model.state({"light": 0.25, "m": 0.75}))
+    found = dx.linearize(model.system, {"q": [0.0, 0.0], "v": [0.0, 0.0]}, params=model.params)
+    np.testing.assert_allclose(np.sort(found.eigenvalues.imag), [-np.sqrt(0.75), np.sqrt(0.75)], rtol=1e-12)

@@ -21,7 +21,7 @@ from dirax.bodies.motion import Direct, Quaternion
 from dirax.bodies.number_checks import check_kinds, check_numbers, check_untraced
 from dirax.bodies.parts import Body
 from dirax.bodies.statement import discretization_map, in_coordinates, on_manifold
-from dirax.diagnostics.linearized_field import accelerations
+from dirax.diagnostics.equations_of_motion import accelerations
 from dirax.geometry.maps import ProductMap
 from dirax.program.user_functions import evaluated
 from dirax.show.scene import Scene
@@ -237,7 +237,8 @@ class Model:
         return assembled(self, q, v, self.params if params is None else params)
 
     def accelerations(self, q: Any, v: Any, params: Any = None) -> dict[str, float]:
-        """The acceleration of every coordinate at data on the constraints."""
+        """The acceleration of every coordinate at data on the constraints. Raises `ValueError` where the equations do not
+        determine accelerations, as where a body has no mass."""
         found, _ = accelerations(self.system, q, v, self.params if params is None else params)
         return dict(zip(self.coordinates, found.tolist(), strict=True))
 

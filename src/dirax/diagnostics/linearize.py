@@ -5,15 +5,17 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import scipy.linalg
-import scipy.sparse.csgraph
 
 from dirax.diagnostics.linearized_field import FieldAt, linearized_chain, linearized_lagrangian
 from dirax.diagnostics.linearized_step import linearized_step
-from dirax.numerics.tolerances import TINY
+from dirax.numerics.eigenvalues import RANK, clusters, is_defective, with_errors
+from dirax.numerics.tolerances import CONSTRAINT_DEFECT, TINY
 from dirax.program.captured import functions_in, refuse_changed
 from dirax.program.user_functions import refuse_traced
-from dirax.run.validate import validated_case
+from dirax.run.final_manifold import is_singular, refuse_off_final_manifold
+from dirax.run.own_equation import shape_of
+from dirax.run.start import completed
+from dirax.run.validate import Case, validated_case
 from dirax.schemes.step import AbstractScheme
 from dirax.systems.system import AbstractSystem
 from dirax.text.tables import text_table
@@ -35,9 +37,6 @@ ROUNDOFF = 2e-14
 
 MULTIPLE = 1e-6
 """Error of eigenvalues of which several are one, relative to the largest one, at most."""
-
-RANK = 1e-9
-"""Singular values, relative to the largest one, that count as zero."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,9 +91,9 @@ class Linearization:
         """Whether eigenvalues that are one, to their error, have fewer eigenvectors than they are: then some small motions grow
         like t times what the eigenvalue says, as those of a free particle do at rest, q = v t."""
         error = self.error * np.abs(self.matrix).max(initial=0.0)
-        values, errors = _with_errors(self.matrix, error)
-        several = (np.mean(values[together]) for together in _clusters(values, errors) if len(together) > 1)
-        return any(_is_defective(self.matrix, complex(value), error) for value in several)
+        values, errors = with_errors(self.matrix, error)
+        several = (np.mean(values[together]) for together in clusters(values, errors) if len(together) > 1)
+        return any(is_defective(self.matrix, complex(value), error) for value in several)
 
     @property
     def modes(self) -> np.ndarray:
@@ -110,8 +109,8 @@ class Linearization:
         if not len(self.matrix):
             return True
         error = self.error * np.abs(self.matrix).max()
-        values, errors = _with_errors(self.matrix, error)
-        for together in _clusters(values, errors):
+        values, errors = with_errors(self.matrix, error)
+        for together in clusters(values, errors):
             values[together] = np.mean(values[together])
         most = MULTIPLE * (np.abs(self.matrix) if self.step is None else np.abs(self.eigenvalues)).max()
         rates = np.real(values)
@@ -120,33 +119,6 @@ class Linearization:
                 rates, errors = np.log(np.abs(values)) / self.step, errors / (np.abs(values) * self.step)
                 error = error / self.step
         return bool(np.all(rates <= np.fmin(errors, max(most, error))))
-
-
-def _is_defective(matrix: np.ndarray, value: complex, error: float) -> bool:
-    """Whether (A − λ)² has more zeros than A − λ, whose entries may be off by `error`."""
-    once = matrix - value * np.eye(len(matrix))
-    sizes, squares = (np.linalg.svd(power, compute_uv=False) for power in (once, once @ once))
-    cut = max(RANK, len(matrix) * error / max(sizes[0], TINY))
-    return bool(np.sum(squares <= cut * sizes[0] ** 2) > np.sum(sizes <= cut * sizes[0]))
-
-
-def _with_errors(matrix: np.ndarray, error: float) -> tuple[np.ndarray, np.ndarray]:
-    """The eigenvalues of a matrix, and by how much each may be off where its entries are by `error`: at most by what four that
-    are one with one eigenvector are."""
-    if not len(matrix):
-        return np.zeros(0, complex), np.zeros(0)
-    values, left, right = scipy.linalg.eig(matrix, left=True)
-    size = np.abs(matrix).max()
-    with np.errstate(divide="ignore"):
-        errors = error / np.abs(np.sum(left.conj() * right, axis=0))
-    return values, np.minimum(errors, size * (error / size) ** 0.25 if size > 0.0 else 0.0)
-
-
-def _clusters(values: np.ndarray, errors: np.ndarray) -> list[np.ndarray]:
-    """The numbers of eigenvalues that may be one."""
-    near = np.abs(values[:, None] - values) <= np.minimum(errors[:, None], errors)
-    labels = scipy.sparse.csgraph.connected_components(near, directed=False)[1]
-    return [np.flatnonzero(labels == label) for label in np.unique(labels)]
 
 
 def _complex(value: complex) -> str:
@@ -185,9 +157,11 @@ def linearize(
 
         dx.linearize(bicycle.MODEL.system, bicycle.straight(5.0), symmetries=bicycle.SYMMETRIES).eigenvalues
 
-    Raises `ValueError` for a place of other names, at one that is no relative equilibrium, and for generators that are no
-    symmetries; `TypeError` for systems on manifolds and on Lie algebras, and for those without a Lagrangian where symmetries or a
-    scheme are given.
+    A singular Lagrangian is linearized on its final manifold, in the coordinates x of the constraint algorithm.
+
+    Raises `ValueError` for a place of other names, one off the constraints or that is no relative equilibrium, where the velocity
+    is not determined, and for generators that are no symmetries; `TypeError` for systems on manifolds and on Lie algebras, and
+    for those without a Lagrangian where symmetries or a scheme are given.
     """
     generators = list(symmetries.values()) if isinstance(symmetries, Mapping) else list(symmetries)
     if (scheme is None) != (step is None):
@@ -201,7 +175,15 @@ def linearize(
         given = f"{', '.join(map(str, at)) or 'nothing'} was given" if isinstance(at, Mapping) else f"{at!r:.80} was given"
         place = ", ".join(f'"{name}": …' for name in wanted)
         raise ValueError(f"the place at which a {type(system).__name__} is linearized is {{{place}}}, but {given}.")
-    at, params = _one_place(system, at, params)
+    at, params, case = _one_place(system, at, params)
+    singular = case is not None and _is_singular(system, case)
+    if singular and (scheme is not None or generators):
+        raise ValueError(
+            "the Lagrangian is singular at the place (∂²L/∂v²): its equations are linearized on its final manifold, without "
+            "scheme= and symmetries=."
+        )
+    if singular:
+        return _reduced(linearized_chain(system.lagrangian_form(), at, params), None)
     if system.lagrangian_form() is None:
         if scheme is not None or generators:
             raise TypeError(
@@ -215,14 +197,32 @@ def linearize(
     return _reduced(linearized_step(system, scheme, step, at, found, params), step)
 
 
-def _one_place(system: AbstractSystem, at: Mapping[str, Any], params: Any) -> tuple[dict[str, Any], Any]:
-    """The place and the params as arrays. Raises `ValueError` for several places, and for numbers that are none of the system."""
+def _one_place(system: AbstractSystem, at: Mapping[str, Any], params: Any) -> tuple[dict[str, Any], Any, Case | None]:
+    """The place and the params as arrays, and as initial data of a Lagrangian. Raises `ValueError` for several places, and for
+    numbers that are none of the system."""
     case = validated_case({name: a for name, a in at.items() if name != "t"}, params, False, 1.0, at.get("t", 0.0))
     if case.batch is not None:
         shapes = ", ".join(f"{name} has shape {np.shape(a)}" for name, a in case.data.items())
         raise ValueError(f"a system is linearized at one place, but {shapes}: give that of one.")
     system.sizes(*case.first)
-    return {**case.data, **({"t": at["t"]} if "t" in at else {})}, case.params
+    place = {**case.data, **({"t": at["t"]} if "t" in at else {})}
+    return place, case.params, case if "q" in case.data else None
+
+
+def _is_singular(system: AbstractSystem, case: Case) -> bool:
+    """Whether ∂²L/∂v² is singular at the place. Raises `ValueError` where it is off the constraints, or no motion passes it."""
+    form = system.lagrangian_form()
+    initial = completed(form, case, False)
+    defect, size = np.ravel(initial.defect), np.ravel(initial.size)[: np.size(initial.defect)]
+    if np.any(np.abs(defect) > CONSTRAINT_DEFECT * size):
+        raise ValueError(
+            f"the place is off the constraint, whose residual is {np.array2string(defect, precision=4)} (largest "
+            f"{np.abs(defect).max():.3g}): a motion is linearized that keeps them."
+        )
+    if not is_singular(form, shape_of(form, *case.first), case, initial):
+        return False
+    refuse_off_final_manifold(form, case, initial)
+    return True
 
 
 def _reduced(found: FieldAt, step: float | None) -> Linearization:

@@ -6,7 +6,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.diagnostics.linearized_field import FieldAt, equations_of, filled, scaled_matrix
+from dirax.diagnostics.equations_of_motion import equations_of
+from dirax.diagnostics.linearized_field import FieldAt, filled, scaled_matrix
 from dirax.engines.lifted import lifted
 from dirax.numerics.equilibration import balanced_inverse
 from dirax.numerics.newton import AT_FLOOR, sizes_of_unknowns
