@@ -37,7 +37,8 @@ class Model:
 
     - `bodies`, `joints`: a tree that hangs on "ground", and joints that close loops (`closes=True`);
     - `contacts` with the ground; `forces`: `Spring`, `Damper` and `Motor`; `gravity` (3,);
-    - `parameters`: numbers by name, which may stand for numbers in bodies, contacts and forces; they are the default params;
+    - `parameters`: numbers by name, which may stand for numbers in bodies, contacts and forces: the params of the model's own
+      functions by default, and `model.params`, which a run is given as params=;
     - `dropped`: names of constraints to be left out, which follow from the others (`redundant` finds them).
 
     `system` is the `dx.LagrangeDirac`, `coordinates` its coordinates' names, `constraints` those of its constraints.

@@ -9,8 +9,10 @@ import numpy as np
 from dirax.diagnostics.equations_of_motion import equations_of
 from dirax.diagnostics.linearized_field import FieldAt, filled, scaled_matrix
 from dirax.engines.lifted import lifted
+from dirax.engines.steps_in_numbers import StepsInNumbers
 from dirax.numerics.equilibration import balanced_inverse
 from dirax.numerics.newton import AT_FLOOR, sizes_of_unknowns
+from dirax.numerics.tolerances import EPSILON
 from dirax.program.memo import Memo, Same
 from dirax.program.tracing import jacobian
 from dirax.program.user_functions import evaluated
@@ -25,7 +27,7 @@ from dirax.systems.shape import Shape
 from dirax.systems.system import AbstractSystem
 
 INVARIANT = 1e-8
-"""How far, relative to the step's derivative, it may lead out of the tangent space of the discrete constraints."""
+"""How far, relative to its entries, the derivative of a step may lead out of the tangent space of the discrete constraints."""
 
 RANK = 1e-12
 """Singular values of linear equations, relative to the largest one, that count as zero."""
@@ -105,10 +107,7 @@ def linearized_step(
         stages.append(_stage(system, stage, time, fraction * h))
         time += fraction * h
     lift = _lift(stages[0], layout, case)
-    state, matrix = first, np.eye(first.size)
-    for stage, guess in zip(stages, began.guess, strict=True):
-        state, slope = stage.step(state, np.asarray(guess), case.params)
-        matrix = slope @ matrix
+    state, matrix = _stepped(equation, stages, first, list(map(np.asarray, began.guess)), case)
     # lifts are tangent to the discrete constraints up to the forces of constraints, of which a step takes no notice
     units = np.max(np.abs(lift) * field.units, axis=1)
     energy = np.max(units[layout.place("p")] * field.units[shape.n :])
@@ -126,6 +125,21 @@ def linearized_step(
     return FieldAt(matrix, _kept(matrix, tangent), symmetric, residual, units, 1.0, error)
 
 
+def _stepped(equation: Any, stages: list, state: np.ndarray, guesses: list, case: Case) -> tuple[np.ndarray, np.ndarray]:
+    """The state after a step and its derivative by this one: by the scalar program of the step, where there is one."""
+    if (steps := StepsInNumbers.found(equation, case.params, False)) is not None:
+        t, one = np.array([case.t0]), np.zeros(1, int)
+        params = steps.parameters(case.params, None, one)
+        made = steps.step(state[None], [guess[None] for guess in guesses], t, case.h, params)
+        if made.good[0]:
+            return made.after[0], steps.differentiated(made, t, case.h, params)[0][0]
+    matrix = np.eye(state.size)
+    for stage, guess in zip(stages, guesses, strict=True):
+        state, slope = stage.step(state, guess, case.params)
+        matrix = slope @ matrix
+    return state, matrix
+
+
 def _kept(matrix: np.ndarray, tangent: np.ndarray) -> np.ndarray:
     """The space near the span of the columns of `tangent` that a step keeps; what is left after TRIES where there is none.
 
@@ -133,12 +147,19 @@ def _kept(matrix: np.ndarray, tangent: np.ndarray) -> np.ndarray:
     directions Q across, M (T + Q X) = (T + Q X) B, which Newton's method finds: QᵀMQ X − X TᵀMT = −QᵀMT.
     """
     size, d = np.abs(matrix).max(), tangent.shape[1]
-    for attempt in range(2 * TRIES):
+    best, least = tangent, np.inf
+    for attempt in range(2 * TRIES + 1):
+        if attempt == TRIES:
+            tangent = best
         whole = np.linalg.qr(tangent, mode="complete")[0]
         tangent, across = whole[:, :d], whole[:, d:]
         image = matrix @ tangent
         outside = across.T @ image
-        if np.abs(across @ outside).max(initial=0.0) <= INVARIANT * size:
+        off = np.abs(across @ outside).max(initial=0.0)
+        nearer = off < least
+        if nearer:
+            best, least = tangent, off
+        if off <= EPSILON * size or (attempt > TRIES and not nearer and least <= INVARIANT * size):
             break
         if attempt < TRIES:
             tangent = image
@@ -146,7 +167,7 @@ def _kept(matrix: np.ndarray, tangent: np.ndarray) -> np.ndarray:
         equations = np.kron(across.T @ matrix @ across, np.eye(d)) - np.kron(np.eye(len(outside)), (tangent.T @ image).T)
         lean = np.linalg.lstsq(equations, -outside.ravel(), rcond=RANK)[0]
         tangent = tangent + across @ lean.reshape(outside.shape)
-    return tangent
+    return best
 
 
 def _stage(system: AbstractSystem, equation: Any, t: float, h: float) -> _Stage:

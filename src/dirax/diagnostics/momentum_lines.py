@@ -93,8 +93,9 @@ def quotient_momentum(sol: Solution, tolerance: float | None) -> list[Line]:
     change, relative = relative_changes(mu, scale)
     lane = int(np.argmax(change))
     text = f"{np.array2string(mu[lane, 0], precision=6)} changed by at most {change[lane]:.2g}{of_lane(sol, lane)}"
-    if quotient.moves_momentum(initial_of_one(sol), sol.params_of_one):
-        return [Line(title, float(change[lane]), None, NOT_CHECKED, f"forces with a part along the group move it; {text}")]
+    if moves := quotient.moves_momentum(initial_of_one(sol), sol.params_of_one):
+        what = moves.split(":")[0]  # whose forces move
+        return [Line(title, float(change[lane]), None, NOT_CHECKED, f"{what} it, which have a part along the group; {text}")]
     return [judged(sol, title, relative, roundoff_limit(tolerance, steps_of(sol)), text)]
 
 

@@ -86,7 +86,7 @@ class Lift(NamedTuple):
     def last_momentum(self, p0: Array, at: Base, rate: Array, momentum: Array, h: Any) -> Float[Array, " N"]:
         """p1, with what is missed of the balance: v is a difference of points over h, and p has 1/h times their roundoff."""
         minus_p0, p1 = self.lifted(at, h * rate, momentum)
-        return p1 + self.tangential(at.q1, p0 + minus_p0)
+        return p1 + self.tangential(at.q1, self.tangential(at.q0, p0 + minus_p0))
 
     def tangential(self, q: Array, vector: Array) -> Float[Array, " N"]:
         """The tangent part at q of an ambient vector."""

@@ -61,7 +61,7 @@ class ProjectedLiftStep(LagrangianStep):
         equations = [
             lift.paired(q0, begun),
             rows.velocity_defect(at.t, at.q, at.v, params),
-            lift.tangents(q0, q1).T @ (momentum - p1 - begun),
+            lift.tangents(q0, q1).T @ (momentum - p1 - lift.tangential(q0, begun)),
             rows.velocity_defect(t + h, q1, v1, params),
         ]
         if rows.holonomic:
