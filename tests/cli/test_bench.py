@@ -41,7 +41,7 @@ def ode_of(example):
 
 
 @pytest.mark.parametrize("name", ["kepler", "rolling-disk", "vortices"])
-@pytest.mark.soak_of("vortices")
+@pytest.mark.soak_of("kepler", "vortices")
 def test_plain_jax_takes_the_steps_of_the_native_engine(name):
     s = short(name)
     state, _ = plain_run(s.one)()
@@ -106,6 +106,7 @@ def test_the_equations_of_a_driven_pendulum_on_a_moving_circle():
 
 
 @pytest.mark.parametrize("name", ["vortices", "lotka-volterra", "heavy-top", "dc-motor"])
+@pytest.mark.soak_of("vortices", "heavy-top")
 def test_a_fine_run_of_dirax_approaches_the_reference(name):
     """Second order: halving the step quarters the distance, so both solve the same equations."""
     example = gallery.get(name)

@@ -237,6 +237,7 @@ def test_settings_change_data_params_and_run():
 
 
 @pytest.mark.parametrize("name", gallery.names())
+@pytest.mark.soak_of("wave-line")
 def test_settings_keep_what_is_not_a_number(name):
     example, _ = changed(gallery.get(name), ())
     for key, value in gallery.get(name).initial.items():
@@ -445,6 +446,9 @@ def test_another_program_keeps_its_own_interruptions():
         ("dx.PortHamiltonian(lambda x: x @ x / 2, J=[[0.0, 1.0], [-1.0, 0.0]])", "dict(x=[1.0, 0.0])", "DiscreteGradient"),
         ("dx.EulerPoincare(dx.SO3(), lambda xi: xi @ xi / 2)", "dict(x=system.state([0.1, 0.2, 1.0]))", "DiscreteEulerPoincare"),
     ],
+)
+@pytest.mark.soak_of(
+    "dx.EulerPoincare(dx.SO3(), lambda xi: xi @ xi / 2)-dict(x=system.state([0.1, 0.2, 1.0]))-DiscreteEulerPoincare"
 )
 def test_a_file_without_a_scheme_has_the_first_that_suits_it(tmp_path, system, initial, scheme):
     """It finds modules that lie beside it, too."""

@@ -13,6 +13,7 @@ SCHEMES = [dx.PlusLagrangeDirac(), dx.MinusLagrangeDirac(), dx.LagrangeDAlembert
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.soak_of("scheme2", "scheme3")
 def test_trajectories_are_stationary_and_their_neighbours_are_not(scheme):
     sol = gallery.get("rolling-disk").simulate(scheme, steps=50)
     rng = np.random.default_rng(1)

@@ -25,7 +25,7 @@ SPACES = [
 
 
 @pytest.mark.parametrize(("group", "advected", "names"), SPACES)
-@pytest.mark.soak_of(but=["group0-0-names0", "group1-2-names1", "group2-0-names2", "group4-0-names4"])
+@pytest.mark.soak_of(but=["group0-0-names0"])
 def test_casimirs_are_all_null_directions_of_the_bivector(group, advected, names):
     space = SemidirectProduct(group, advected)
     found = casimirs(space)

@@ -148,6 +148,7 @@ def test_explicit_equations_are_the_reference_where_there_are_some():
 
 
 @pytest.mark.parametrize("name", ["kepler", "rolling-disk", "snakeboard", "lotka-volterra", "dc-motor"])
+@pytest.mark.soak_of("kepler", "rolling-disk")
 def test_the_explicit_solution_is_that_of_dop853(name):
     from dirax.diagnostics.bench.ode_solvers import compiled_field
     from dirax.diagnostics.explicit_solution import explicit_solution

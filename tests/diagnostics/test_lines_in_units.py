@@ -86,6 +86,7 @@ def test_steps_by_collocation_are_solved_whatever_the_mass(engine):
 
 
 @pytest.mark.parametrize("scheme", [dx.Collocation(2), dx.LagrangeDAlembert()])
+@pytest.mark.soak_of("scheme0")
 def test_steps_at_an_equilibrium_are_solved(scheme):
     """The force 0.981 − 0.981 leaves speeds of a rounding, to which nothing is relative."""
     system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - 2.943 * q[0] ** 2 + 0.981 * q[0])

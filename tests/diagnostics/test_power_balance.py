@@ -54,6 +54,7 @@ def test_the_midpoint_map_balances_its_own_power_and_has_no_books():
 
 
 @pytest.mark.parametrize("changed", ["x", "work", "power"])
+@pytest.mark.soak_of("x", "power")
 def test_cooked_books_are_found(changed):
     sol = driven(dx.DiscreteGradient(), steps=50)
     values = np.array(sol.fields[changed])
@@ -72,6 +73,7 @@ def test_batches_and_saved_rows():
 
 
 @pytest.mark.parametrize("scheme", [dx.DiscreteGradient(), dx.DiscreteDirac(), dx.EnergyCollocation()])
+@pytest.mark.soak_of(but=["scheme1"])
 def test_a_system_at_rest_balances(scheme):
     """Nothing is stored, supplied or dissipated: 0/0 was a violation."""
     system = dx.PortHamiltonian(hamiltonian, J, B, R)
@@ -89,6 +91,7 @@ def test_books_over_a_million_steps():
 
 
 @pytest.mark.parametrize("batch", [False, True])
+@pytest.mark.soak_of("False")
 def test_a_resistance_that_becomes_negative_on_the_way_is_said(batch):
     """R is asked for where a run begins; here it creates energy where x < 1/2, and every balance is kept."""
     system = dx.PortHamiltonian(

@@ -101,7 +101,7 @@ def assert_seen(sol, but: tuple[str, ...] = (), alone: bool = False):
 
 
 @pytest.mark.parametrize("name", RUNS)
-@pytest.mark.soak_of(but=["plus", "minus", "Method 1", "adjoint", "collocation"])
+@pytest.mark.soak_of(but=["plus", "collocation"])
 def test_every_damage_is_seen(name):
     assert_seen(run(name))
 
@@ -131,7 +131,7 @@ def test_also_where_rows_are_far_apart(name):
 
 
 @pytest.mark.parametrize(("apart", "verdict"), [(100, "ok"), (1000, "ok"), (FAR, "not checked")])
-@pytest.mark.soak_of("100-ok")
+@pytest.mark.soak_of("100-ok", "1000-ok")
 def test_roundoff_that_many_chaotic_steps_enlarge_is_no_damage(apart, verdict):
     potential = lambda q: 9.81 * (2 * jnp.cos(q[0]) + jnp.cos(q[1]))
     system = dx.LagrangeDirac(lambda q, v: v[0] ** 2 + v[1] ** 2 / 2 + v[0] * v[1] * jnp.cos(q[0] - q[1]) + potential(q))
@@ -220,6 +220,7 @@ def test_a_scheme_whose_state_is_not_saved_says_so():
     assert "does not start from a saved row" in line.explanation
 
 
+@pytest.mark.soak
 def test_another_solution_of_the_equations_of_a_step_is_one():
     """sin has many: which of them Newton's method finds is no matter of right and wrong, and one is told from none."""
     pendulum = dx.LagrangeDirac(lambda q, v: v @ v / 2 + jnp.cos(q[0]))

@@ -480,6 +480,7 @@ def test_a_driven_motion_from_rest_has_not_blown_up():
 
 
 @pytest.mark.parametrize("event", [dx.Event(lambda q: q[0]), dx.Impact(lambda q: q[0] + 0.5)])
+@pytest.mark.soak_of("event1")
 def test_missing_rows_are_seen_beside_events(event):
     """Rows after a terminal event are missing rightly, and others are not."""
     oscillator = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q / 2)

@@ -44,6 +44,7 @@ alone = functools.cache(run)
 
 @by_case
 @pytest.mark.parametrize("every", [1, 3])
+@pytest.mark.soak_of("1-suzuki4", "1-yoshida4 of Method 2", "1-symmetric", "1-port, discrete gradient")
 def test_batches_of_any_size_have_the_bits_of_single_runs(case, every):
     for size in (1, 2, 3, 5, 7, 9):
         sol = run(case, slice(size), save_every=every)

@@ -38,7 +38,7 @@ def run(system, scheme, momentum=MOMENTUM, scale=1.3, steps=40, **more):
 
 
 @pytest.mark.parametrize("scheme", SCHEMES.values(), ids=SCHEMES)
-@pytest.mark.soak_of("collocation", "energy collocation", "variable steps")
+@pytest.mark.soak_of(but=["discrete gradient", "composition"])
 def test_steps_with_roots_are_those_of_the_formula_of_the_root(scheme):
     found, known = run(BY_ROOTS, scheme), run(BY_FORMULA, scheme)
     assert found.stats["engine"] == known.stats["engine"] == "native"
@@ -140,6 +140,7 @@ def test_a_motion_whose_momentum_comes_to_have_no_velocity_ends_there(scheme):
 
 
 @pytest.mark.parametrize("flux", [-5e-4, -5e-3])
+@pytest.mark.soak_of("-0.0005")
 def test_a_root_that_is_not_there_at_the_guess_of_a_long_step(flux):
     """A guess that leads a coil beyond what a diode lets back; x by shorter steps is the same up to their error."""
     circuit = dx.circuit([("L", 1, 0, 1.0), ("R", 1, 0, DIODE), ("C", 2, 0, 1.0), ("R", 2, 0, 1.0)])

@@ -347,6 +347,7 @@ def test_kernels_are_cached_on_disk_and_damaged_entries_are_made_again(tmp_path,
 
 @pytest.mark.parametrize("name", ["rolling disk, midpoint", "Hénon–Heiles"])
 @pytest.mark.parametrize("size", [None, 11])
+@pytest.mark.soak_of("None-rolling disk, midpoint", "11-rolling disk, midpoint")
 def test_code_that_is_ready_soon_has_the_bits_of_quick_code(name, size, monkeypatch):
     monkeypatch.setenv("DIRAX_CACHE", "off")
     levels = compiled_levels(monkeypatch)
@@ -590,6 +591,7 @@ def test_a_step_that_is_singular_at_its_first_guess_alone_is_taken():
     np.testing.assert_allclose(sol.p[0, :-1], velocity + pull, atol=1e-9 * np.max(np.abs(pull)))
 
 
+@pytest.mark.soak
 def test_a_place_near_a_singular_jacobian_is_no_solution():
     """There unknowns have any size: residuals are measured by sizes that are sure."""
     (system, _), h = bodies(0.0), 0.4

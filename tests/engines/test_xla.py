@@ -143,6 +143,7 @@ def clock_equation() -> StepEquation:
 
 
 @pytest.mark.parametrize("batch", [None, 2])
+@pytest.mark.soak_of("2")
 def test_time_is_the_number_of_steps_times_the_step(batch):
     """Not a running sum: k·h to the last bit, in the step and in the rows, after a two-point start as well."""
     state = np.zeros(2) if batch is None else np.zeros((batch, 2))

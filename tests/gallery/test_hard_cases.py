@@ -39,6 +39,7 @@ CASES = [
 
 
 @pytest.mark.parametrize(("example", "params", "by_hand", "free"), CASES)
+@pytest.mark.soak_of(but=["example1-params1-contact_by_hand-free1"])
 def test_method_2_converges_to_the_equations_by_hand(example, params, by_hand, free):
     q, v = example.initial["q"], example.initial["v"]
     start = np.concatenate([q, v[list(free)]])

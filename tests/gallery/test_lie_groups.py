@@ -154,6 +154,7 @@ def test_sleigh_on_se2_is_the_sleigh_in_the_plane():
     assert orders(np.array(errors).T) == pytest.approx(np.full((2, 2), 2.0), abs=0.1)
 
 
+@pytest.mark.soak
 def test_constraint_that_the_body_sees_turning():
     """Veselova's problem: ω·γ = 0 for a direction fixed in space; λ by differentiating the constraint by hand."""
     system = dx.EulerPoincare(SO3, lambda xi, a: xi @ (jnp.asarray(I) * xi) / 2, lambda a: a[None], advected=3)

@@ -36,6 +36,7 @@ def test_andrews_squeezer_ends_where_the_test_set_says():
     assert np.abs((16 * once[1] - once[0]) / 15 - andrews_squeezer.REFERENCE).max() < 4e-9
 
 
+@pytest.mark.soak
 def test_the_car_axis_ends_where_the_test_set_says():
     sol = car_axis.EXAMPLE.simulate(dx.Collocation(4, "lobatto"), step=3 / 2000, steps=2000, save_every=2000)
     assert sol.ok and np.abs(sol.q[-1] - car_axis.REFERENCE).max() < 2e-12
@@ -106,6 +107,7 @@ def test_gaits_ride_ahead_on_their_skates_alone(ridden):
     assert np.abs(still.q[-1, :2]).max() < 1e-3
 
 
+@pytest.mark.soak
 def test_the_parallelogram_is_a_pendulum():
     sol = four_bar.EXAMPLE.simulate(step=0.005, steps=400)
     field = lambda t, y: [y[1], -1.2 * 9.81 * np.sin(y[0])]

@@ -12,6 +12,7 @@ METHODS = (dx.DiscreteDirac(), dx.DiscreteDirac(constraints="resolve"))
 
 
 @pytest.mark.parametrize("name", ["knife-edge", "chaplygin-sleigh"])
+@pytest.mark.soak_of("knife-edge")
 def test_exact_solutions_are_followed_with_order_2_by_both_methods(name):
     example = gallery.get(name)
     for scheme in METHODS:

@@ -31,7 +31,7 @@ class Bent(dx.AbstractDiscretizationMap):
 
 @pytest.mark.parametrize("map", [dx.Midpoint(), dx.Theta(0.3), Bent()], ids=["midpoint", "θ", "bent"])
 @pytest.mark.parametrize("alpha", [ALPHA, LINEAR], ids=["bent α", "linear α"])
-@pytest.mark.soak_of("bent \\u03b1-midpoint", "bent \\u03b1-bent")
+@pytest.mark.soak_of("bent \\u03b1-midpoint", "bent \\u03b1-\\u03b8", "bent \\u03b1-bent")
 def test_the_printed_equations(map, alpha):
     """(16)–(18) index by index: ∂α_k/∂q^l at R¹ and R², twice antisymmetrized, since dq^i ∧ dq^j sees no more."""
     missed = dx.symplectic_equations(map, SYSTEM(alpha).two_form, Q, V)

@@ -119,6 +119,7 @@ def test_pairing_flat_and_two_form_by_hand():
 
 @SOME
 @given(SEEDS, SIGNS, STEPS)
+@pytest.mark.soak
 def test_induced_members_are_those_of_proposition_5_17(seed, sign, h):
     rng = np.random.default_rng(seed)
     D = InducedFiniteDifferenceDirac(forms_on_q, step=h, sign=sign)
@@ -318,7 +319,7 @@ def test_discretization_map_structures_refuse_other_objects():
 
 
 @pytest.mark.parametrize("rank", [0, 1, 2, "dependent"])
-@pytest.mark.soak_of("1")
+@pytest.mark.soak_of(but=["0", "2"])
 def test_the_slope_of_a_projected_covector(rank):
     """∂(P(q)α)/∂q by the formula of Golub and Pereyra against central differences of P(q)α, by singular values."""
     w = np.random.default_rng(5).normal(size=(2, 4, 4))

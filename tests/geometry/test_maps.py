@@ -94,7 +94,7 @@ def report_of(name):
 @pytest.mark.parametrize("name", MAPS)
 @examples
 @given(seed=seeds, scale=st.floats(1e-8, 0.8))
-@pytest.mark.soak_of(but=["explicit Euler", "theta", "implicit Euler", "midpoint", "torus"])
+@pytest.mark.soak_of(but=["explicit Euler", "theta", "implicit Euler", "midpoint"])
 def test_defining_properties(name, seed, scale):
     report, off = report_of(name)(*random_arrays(seed, 2, BATCH, MAPS[name][1]), scale)
     assert np.max(report.point_defect) < 1e-14  # (D1)
@@ -139,7 +139,7 @@ def lift_report_of(name):
 )
 @examples
 @given(seed=seeds, scale=st.floats(1e-8, 0.8))
-@pytest.mark.soak_of("SO2", "SO3", "product", "sphere", "sphere projection")
+@pytest.mark.soak_of(but=["implicit Euler", "theta"])
 def test_lifts_are_symplectic_discretization_maps(name, seed, scale):
     defects, slope_defect = lift_report_of(name)(*random_arrays(seed, 2, BATCH, 2 * MAPS[name][1]), scale)
     for law, defect in defects.items():
@@ -285,6 +285,7 @@ def test_lifted_group_map_has_a_discrete_momentum_map():
         np.testing.assert_allclose(spatial_momentum(x0), spatial_momentum(x1), atol=1e-14)
 
 
+@pytest.mark.soak
 def test_lift_takes_either_quaternion_of_a_rotation():
     lift = cotangent_lift(LieGroupExp(SO3(), 0.5))
     x, v = random_tangent(lift, *random_arrays(10, 2, 8), 0.6)
@@ -369,6 +370,7 @@ def test_the_dimension_of_an_image_is_asked_where_a_run_begins():
 
 
 @pytest.mark.parametrize("x", [np.zeros(4), np.ones(4), np.array([1.0, -1.0, 0.5, 0.5])], ids=str)
+@pytest.mark.soak_of("[0. 0. 0. 0.]")
 def test_a_frame_does_not_turn_with_a_rounding(x):
     """The projections to tangent spaces have one singular value, of which singular vectors are any: a run chose others in each
     update of Newton's method and never ended."""

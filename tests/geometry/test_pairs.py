@@ -48,6 +48,7 @@ def test_forms_by_hand():
 
 
 @pytest.mark.parametrize(("sign", "scheme"), [("+", dx.PlusLagrangeDirac), ("-", dx.MinusLagrangeDirac)])
+@pytest.mark.soak_of("+-PlusLagrangeDirac")
 def test_the_flow(sign, scheme):
     """Against SciPy's root of (20), and rows of the schemes; D_DEL L_d lies in Δ°."""
     pairs = dx.DiscreteLagrangianSystem(ld, FORMS, sign=sign)

@@ -48,7 +48,7 @@ REPRESENTATIONS = {
 
 
 @pytest.mark.parametrize("name", REPRESENTATIONS)
-@pytest.mark.soak_of("two_form", "subspace", "annihilator")
+@pytest.mark.soak_of("two_form", "bivector", "subspace", "annihilator", "kernel")
 def test_at_a_point(name):
     functions = REPRESENTATIONS[name]
     structure = getattr(DiracStructure, f"from_{name}")(*functions)

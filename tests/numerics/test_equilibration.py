@@ -14,7 +14,7 @@ TRIANGULAR = np.array([[1.0, 3e-13, 0.0], [0.0, 0.7, 5.0], [0.0, 4.0, -0.3]])
 
 @pytest.mark.parametrize("matrix", [COUPLED, SADDLE, TRIANGULAR])
 @pytest.mark.parametrize("xp", [np, jnp])
-@pytest.mark.soak_of("jax.numpy-matrix1")
+@pytest.mark.soak_of("jax.numpy-matrix0", "jax.numpy-matrix1")
 def test_scaled_matrices_in_other_units(matrix, xp):
     """A weak entry, that alone connects two parts of a matrix, says how their units are to each other."""
     find = lambda matrix: geometric_scales(matrix, xp)

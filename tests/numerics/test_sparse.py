@@ -104,6 +104,7 @@ MATRICES = {
 
 
 @pytest.mark.parametrize("name", MATRICES)
+@pytest.mark.soak_of("saddle point of a ring", "rows in another order")
 def test_elimination(name):
     matrix, kind = MATRICES[name]
     matrix.sort_indices()

@@ -64,6 +64,7 @@ def test_gradients_are_those_of_jax(name):
 
 
 @pytest.mark.parametrize("name", ["polynomial", "powers", "branches", "a rule of its own", "a corner"])
+@pytest.mark.soak_of("a rule of its own")
 def test_second_derivatives_are_those_of_jax(name):
     f = SCALARS[name]
     assert on_graph(jacobian(gradient(f)), POINT) == pytest.approx(by_jax(jax.hessian(f)), rel=1e-12, abs=1e-12)

@@ -33,7 +33,7 @@ def split_in_a_loop(q):
         lambda q: q[0] ** 2 * (jnp.uint64(2**63 + 12345) >> 60).astype(float) / 16,
     ],
 )
-@pytest.mark.soak_of(but=["<lambda>1", "split_in_a_loop"])
+@pytest.mark.soak_of(but=["split_in_a_loop"])
 def test_both_engines_take_them(potential):
     system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q / 2 - potential(q))
     run = dict(q=[1.0], v=[0.2], step=0.1, steps=20)

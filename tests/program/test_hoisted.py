@@ -86,6 +86,7 @@ GIVEN = [{}, {"q": [0.5, 0.1]}, {"params": {"s": 2.0}}, {"q": [0.5, 0.1], "param
 
 @pytest.mark.parametrize("given", GIVEN, ids=str)
 @pytest.mark.parametrize("traced", ["closed over", "params"])
+@pytest.mark.soak_of("closed over-{}", "params-{}")
 def test_a_run_that_is_prepared_where_jax_traces(traced, given):
     """What it was given later was left out without a word."""
 
@@ -99,6 +100,7 @@ def test_a_run_that_is_prepared_where_jax_traces(traced, given):
     assert float(jax.grad(loss)(K)) == pytest.approx(float(near), rel=1e-8, abs=1e-12)
 
 
+@pytest.mark.soak
 def test_a_global_that_has_changed_is_read_again(monkeypatch):
     """It was refused although it was stated again."""
     loss = lambda k: end(lambda q, v: v @ v / 2 - FACTOR * k * q @ q / 2)

@@ -67,7 +67,7 @@ def compared(closed, *arguments):
 
 @pytest.mark.parametrize("indices", [NEAR, FAR], ids=["inside", "outside"])
 @pytest.mark.parametrize("name", FUNCTIONS)
-@pytest.mark.soak_of("along an axis-inside", "one-inside")
+@pytest.mark.soak_of("rows-inside", "along an axis-inside", "one-inside", "set-inside")
 def test_what_is_read_and_written(name, indices):
     _, found = compared(jax.make_jaxpr(FUNCTIONS[name])(indices), jnp.asarray(indices))
     assert found

@@ -32,7 +32,7 @@ FUNCTIONS = {
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
-@pytest.mark.soak_of("of whole numbers", "derivative of reads")
+@pytest.mark.soak_of("windows", "of whole numbers", "derivative of reads")
 def test_known_places(name):
     function = FUNCTIONS[name]
     found = in_numpy(function, [np.stack([X, 2 * X]), np.stack([U, 3 * U])], (name, "known places"))

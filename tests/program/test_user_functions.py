@@ -150,6 +150,7 @@ MEANT = {
 
 
 @pytest.mark.parametrize("name", MEANT)
+@pytest.mark.soak_of("clip")
 def test_indices_may_be_outside_where_it_is_said_what_is_read_there(name):
     q = jnp.array([0.5, 1.5, 2.5])
     assert UserFunction(MEANT[name], "force", ("q",)).shape(q, None).dtype == float

@@ -103,7 +103,7 @@ def test_composed_reduced_runs_are_the_unreduced_ones(scheme):
 
 
 @pytest.mark.parametrize("name", ["midpoint", "(-)", "of functions"])
-@pytest.mark.soak_of(but=["(-)"])
+@pytest.mark.soak
 def test_and_by_a_connection_that_is_not_linear(name):
     agree(*both(PLAIN, SCHEMES[name], BENT, Q, V), tolerance=3e-14)
 

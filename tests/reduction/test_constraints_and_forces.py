@@ -32,7 +32,7 @@ def compared(system, scheme, fibre, twisted: bool, **settings):
 @pytest.mark.parametrize(
     ("scheme", "twisted"), [(dx.PlusLagrangeDirac(), False), (dx.MinusLagrangeDirac("midpoint"), True), (OUTGOING, True)]
 )
-@pytest.mark.soak_of("scheme0-False")
+@pytest.mark.soak_of(but=["scheme2-True"])
 def test_rolling_disk_without_its_place(scheme, twisted):
     """x and y of the contact point are cyclic; the rolling force moves their momenta."""
     _, _, quotient = compared(
@@ -81,7 +81,7 @@ def test_holonomic_constraint_force_and_time():
 
 
 @pytest.mark.parametrize("rule", ["right", "trapezoidal"])
-@pytest.mark.soak_of("right")
+@pytest.mark.soak
 def test_momentum_changes_by_the_group_part_of_the_force(rule):
     """Drag in space alone leaves the charge; a force along θ adds its impulses, here c·t, to it."""
     push = 0.25

@@ -130,7 +130,7 @@ LONG = "andrews-squeezer", "n-four-bar"
     "name",
     [slow(name) if name in LONG else name for name in WITHOUT if isinstance(gallery.get(name).system, dx.LagrangeDirac)],
 )
-@pytest.mark.soak_of("four-bar", "bricard")
+@pytest.mark.soak_of("oscillator-chain", "four-bar", "bricard")
 def test_systems_without_translations(name):
     example = gallery.get(name)
     assert len(dx.translation_symmetries(example.system, example.initial["q"], params=example.params, radius=0.3)) == 0

@@ -33,7 +33,7 @@ def on_matrices(group):
 
 
 @pytest.mark.parametrize("group", [SO2, SE2, SO3, SE3])
-@pytest.mark.soak_of("group2", "group3")
+@pytest.mark.soak_of(but=["group0"])
 def test_inertia_is_that_of_the_matrices(group):
     body = dx.reduce(dx.ManifoldLagrangian(on_matrices(group), group), group)
     assert isinstance(body, dx.EulerPoincare)
@@ -146,6 +146,7 @@ KNIFE_IN_SPACE = lambda q: jax.jacfwd(lambda v: jax.jvp(SO3.matrix, (q,), (v,))[
         (lambda: dx.reduce(dx.LagrangeDirac(FREE), LEFT), TypeError, "or a Lie group such as"),
     ],
 )  # fmt: skip
+@pytest.mark.soak_of("<lambda>-ValueError-message0")
 def test_mistakes(make, kind, message):
     with pytest.raises(kind, match=message):
         make()

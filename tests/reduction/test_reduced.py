@@ -52,6 +52,7 @@ def test_charged_particle_table_1_of_the_paper():
 
 
 @pytest.mark.parametrize("horizontal", [None, TWISTED])
+@pytest.mark.soak_of("None")
 def test_the_connection_satisfies_its_axioms(horizontal):
     rng = np.random.default_rng(1)
     connection = dx.LinearConnection([2], horizontal)

@@ -38,6 +38,7 @@ def particle():
         (DiscreteRouth, CURVED),
     ],
 )
+@pytest.mark.soak_of("PlusLagrangeDirac-connection1", "DiscreteRouth-connection3")
 def test_particle_on_the_quotient_is_the_particle(particle, scheme, connection):
     quotient = run(PARTICLE, dx.reduce(PARTICLE.system, connection), scheme("midpoint"))
     lifted = dx.reconstruct(quotient)
@@ -47,6 +48,7 @@ def test_particle_on_the_quotient_is_the_particle(particle, scheme, connection):
     assert quotient.vertical[7] == pytest.approx(np.asarray(vertical), abs=1e-11)
 
 
+@pytest.mark.soak
 def test_routh_where_l_is_not_quadratic_in_the_group_velocity():
     relativistic = dx.LagrangeDirac(lambda q, v: -jnp.sqrt(1 - v[0] ** 2 - q[0] ** 2 * v[1] ** 2) + 0.2 / q[0])
     start = {"q": [1.0, 0.0], "v": [0.1, 0.5], "step": 0.02, "steps": 300}
@@ -143,6 +145,7 @@ def test_mistakes():
 
 
 @pytest.mark.parametrize("scheme", [dx.DiscreteRouth("left"), dx.PlusLagrangeDirac("left")])
+@pytest.mark.soak_of("scheme0")
 def test_symmetric_compositions_on_the_quotient(scheme):
     """Φ_{h/2} ∘ Φ*_{h/2} of the scheme of order 1 has order 2, and is that of the unreduced system."""
     reduced, ends = dx.reduce(KEPLER, dx.LinearConnection([1])), []

@@ -32,6 +32,7 @@ def verdicts(sol):
 
 
 @pytest.mark.parametrize(("scheme", "name"), [(dx.PlusLagrangeDirac(), STRUCTURE[0]), (dx.DiscreteRouth("left"), STRUCTURE[2])])
+@pytest.mark.soak_of("scheme1-discrete Dirac structure")
 def test_free_systems(scheme, name):
     sol = particle(scheme)
     found = verdicts(sol)

@@ -230,6 +230,7 @@ def test_counts_beyond_what_is_counted(name, most):
 
 
 @pytest.mark.parametrize("engine", ["native", pytest.param("xla", marks=pytest.mark.soak)])
+@pytest.mark.soak
 def test_largest_counts(engine):
     """Rows 0 and 3 alone are saved; the derivative takes as long as the run does."""
     run = lambda q, **more: dx.simulate(OSCILLATOR, PLUS, **(GOOD | {"q": q, "engine": engine, "save_every": 2**63 - 1} | more))
@@ -305,6 +306,7 @@ def test_dependent_one_forms():
     complaint(ValueError, "constraint 0", "no direction", "of trajectory 1", system=sometimes, **batch)
 
 
+@pytest.mark.soak
 def test_a_lagrangian_singular_together_with_its_constraints():
     """[PY] (21): q1 occurs neither in L's velocities nor in the constraint."""
     loose = dx.LagrangeDirac(lambda q, v: v[0] ** 2 / 2 - q[1] * q[0])
@@ -433,6 +435,7 @@ def test_a_run_that_grows_beyond_all_bounds_is_not_told_to_take_larger_steps():
 
 
 @pytest.mark.parametrize("scheme", [dx.LagrangeDAlembert(), dx.PlusLagrangeDirac()])
+@pytest.mark.soak_of("scheme0")
 def test_a_step_that_is_too_small_for_double_precision(scheme):
     """g(q)/h carries ε/h ≈ 2·10⁻⁸ of noise: more of it in a smaller step, which is not what is advised. Method 2 has none."""
     pendulum = dx.LagrangeDirac(lambda q, v: v @ v / 2 - 9.81 * q[1], holonomic=lambda q: jnp.stack([q @ q - 1.0]))
@@ -457,7 +460,7 @@ def test_a_step_that_becomes_singular():
 
 @pytest.mark.parametrize("engine", ["xla", "native"])
 @pytest.mark.parametrize("batch", [False, True])
-@pytest.mark.soak_of("False-xla", "True-xla")
+@pytest.mark.soak_of(but=["True-native"])
 def test_ctrl_c_keeps_what_was_computed(batch, engine):
     """The signal itself, sent while the run reports its progress."""
     seen = []
@@ -550,6 +553,7 @@ def test_method_2_of_a_singular_lagrangian_needs_its_final_manifold():
 
 
 @pytest.mark.parametrize("scheme", [dx.DiscreteDirac(constraints="resolve"), dx.EnergyCollocation(2)])
+@pytest.mark.soak_of("scheme1")
 def test_a_degenerate_two_form_needs_its_final_manifold(scheme):
     form = dx.DiracStructure.from_two_form(lambda x: jnp.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]))
     system = dx.DiracSystem(form, lambda x: x @ x / 2 - x[0] * x[2])

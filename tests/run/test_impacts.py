@@ -36,6 +36,7 @@ def test_events_stand_beside_walls():
     assert np.max(np.abs(sol.events.of(1).t - [1.0, 1.0 + 2 * FALL])) <= 1e-13
 
 
+@pytest.mark.soak
 def test_events_beside_walls_of_a_system_that_takes_whole_numbers():
     """JAX computes the states there, for there is no scalar program."""
     heavy = dx.LagrangeDirac(lambda q, v, params: v @ v / 2 - params.astype(float) * q[1])

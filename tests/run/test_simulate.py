@@ -35,6 +35,7 @@ def symplectic_euler(q, v, h, steps, omega=1.0):
 
 @ENGINES
 @pytest.mark.parametrize("steps, every", [(1, 1), (7, 1), (12, 3), (13, 3), (5, 100), (1, 7)])
+@pytest.mark.soak_of("1-1-xla")
 def test_rows_and_times(steps, every, engine):
     """steps + 1 rows; with save_every the multiples of it, and the last row always."""
     sol = dx.simulate(OSCILLATOR, PLUS, q=[1.0], v=[0.5], step=0.1, steps=steps, save_every=every, t0=3.0, engine=engine)

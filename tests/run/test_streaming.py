@@ -60,7 +60,7 @@ def same(ours, theirs):
 
 
 @pytest.mark.parametrize(("name", "every"), [*((name, 1) for name in RUNS), ("native", 3), ("sparse", 3), ("two points", 3)])
-@pytest.mark.soak_of("xla-1", "sparse-1", "multipliers-1", "a batch-1", "a batch with a failure-1")
+@pytest.mark.soak_of(but=["native-3", "two points-3"])
 def test_has_the_bits_of_a_run_in_memory(name, every, tmp_path):
     path, theirs = tmp_path / "run.zarr", run(name, 40, save_every=every)
     first = run(name, 11, save_every=every, to=path)
@@ -78,6 +78,7 @@ def test_has_the_bits_of_a_run_in_memory(name, every, tmp_path):
 
 @pytest.mark.parametrize("stops", [KeyboardInterrupt, SystemExit])
 @pytest.mark.parametrize("where", ["put", "mark"])
+@pytest.mark.soak_of(but=["mark-KeyboardInterrupt"])
 def test_what_stops_a_run_keeps_what_was_written(where, stops, tmp_path, monkeypatch):
     path, calls, method = tmp_path / "run.zarr", [], getattr(RunStore, where)
 

@@ -75,6 +75,7 @@ def orders(errors, h):
 
 @pytest.mark.parametrize(("stages", "steps"), [(1, (80, 160, 320)), (2, (60, 90, 120)), (3, (48, 64, 96)), (4, (40, 48, 64))])
 @pytest.mark.parametrize("forces", [False, True])
+@pytest.mark.soak_of("False-1-steps0", "True-2-steps1", "True-3-steps2", "True-4-steps3")
 def test_order_in_positions_momenta_and_work(stages, steps, forces):
     force = (lambda t, q, v, params: jnp.array([0.4 * jnp.cos(t), 0.0]) - 0.2 * v) if forces else None
     system = dx.LagrangeDirac(double_pendulum, forces=force)
@@ -177,6 +178,7 @@ def test_engines_agree_and_halved_steps_change_nothing_at_high_order(name):
 
 
 @pytest.mark.parametrize("name", ["accelerations", "rates of a mass matrix", "not quadratic in v"])
+@pytest.mark.soak_of(but=["not quadratic in v"])
 def test_steps_are_symplectic_and_self_adjoint(name):
     system, data, step = SYSTEMS[name]
     sol = dx.simulate(system, dx.Collocation(3), step=step, steps=30, **data)

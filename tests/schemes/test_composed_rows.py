@@ -35,7 +35,7 @@ def mean_tension(intervals):
     ("name", "order", "engine"),
     [("suzuki4", 4, "native"), ("yoshida4", 4, "native"), ("kahan-li6", 6, "native"), ("yoshida4", 4, "xla")],
 )
-@pytest.mark.soak_of("yoshida4-4-xla")
+@pytest.mark.soak_of("suzuki4-4-native", "yoshida4-4-xla")
 def test_the_impulse_of_a_composed_step_is_the_whole_steps(name, order, engine):
     """The first part of a step of suzuki4 has .4145 of the tension, of yoshida4 1.3512."""
     errors = []
@@ -102,6 +102,7 @@ def reference():
     ],
     ids=["suzuki4", "kahan-li6", "symmetric", "symmetric-yoshida4"],
 )
+@pytest.mark.soak_of("suzuki4-native")
 def test_with_one_forms_every_field_has_the_order_of_q(reference, engine, scheme, order):
     errors = []
     for steps in (10, 20, 40):
@@ -193,6 +194,7 @@ def skated(t):
     return np.stack([u * np.cos(t), u * np.sin(t), np.ones_like(t)], axis=1), 1 - np.cos(t) - t
 
 
+@pytest.mark.soak
 def test_method_1_has_its_order_in_momenta_and_multipliers_too():
     """What is off the constraint in p changes its sign in every plain step, and stayed of order 2."""
     systems = SKATE, dx.NonholonomicMechanics(lambda q: jnp.eye(3), lambda q: q[0] / 2, lambda q: SKATE.one_forms(q, None))

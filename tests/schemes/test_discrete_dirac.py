@@ -82,6 +82,7 @@ def disk_error(sol, reference):
 
 
 @pytest.mark.parametrize("constraints, errors", [("discretize", (4.208e-3, 1.0527e-3)), ("resolve", (4.207e-3, 1.0527e-3))])
+@pytest.mark.soak_of("discretize-errors0")
 def test_rolling_disk_errors_of_methods_1_and_2(constraints, errors, disk_reference):
     scheme = dx.DiscreteDirac(constraints=constraints)
     for h, expected in zip((0.02, 0.01), errors, strict=True):

@@ -229,7 +229,7 @@ ALSO_BY_XLA = ("explicit time", "ports", *LONG)
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.soak) if n in LONG else n for n in SYSTEMS])
-@pytest.mark.soak_of(but=["canonical"])
+@pytest.mark.soak
 def test_every_system_with_a_bracket(name):
     system, data, step = SYSTEMS[name]
     run = lambda scheme, h, n, **more: dx.simulate(system, scheme, step=h, steps=n, **data, **more)

@@ -243,7 +243,7 @@ def test_saved_momenta(momentum, share):
 
 @pytest.mark.parametrize("base", BASES)
 @pytest.mark.parametrize("rule", RULES)
-@pytest.mark.soak_of("midpoint-midpoint")
+@pytest.mark.soak_of(but=["left-right"])
 def test_step_equation_is_the_equations(rule, base):
     """Residual, next state and saved arrays at arbitrary points and unknowns, solved or not."""
     equation = dx.make_step_equation(dx.LagrangeDAlembert(rule, base, momentum="mean"), CURVED, Shape(3, 1))

@@ -128,6 +128,7 @@ def test_a_gradient_against_finite_differences():
 
 
 @pytest.mark.parametrize("theta", [0.0, 1.0])
+@pytest.mark.soak_of("1.0")
 def test_one_sided_maps_keep_the_constraints_too(theta):
     errors = []
     for steps in (50, 100, 200):
@@ -141,6 +142,7 @@ def test_one_sided_maps_keep_the_constraints_too(theta):
 # --------------------------------------------------------------------- moving, mixed, redundant and driven constraints
 
 
+@pytest.mark.soak
 def test_a_moving_pivot_of_a_mass_that_changes():
     """The pivot at x = .3 cos 2t; mass and weight grow as e^{.2t}, a drag that leaves the direction alone: θ̈ + .2 θ̇ + …"""
     grown = lambda t: jnp.exp(0.2 * t)

@@ -54,6 +54,7 @@ def test_a_users_discrete_lagrangian_beside_the_form_constrained_in_flat_space(n
 
 
 @pytest.mark.parametrize("constraint", ["right", "left"])
+@pytest.mark.soak_of("right")
 def test_the_plus_and_minus_equations_without_charts(constraint):
     """W at one end on the velocity that the retraction gives there, and h L of that velocity at the first point."""
     sol = dx.simulate(TIED, SCHEMES[constraint](), **FROM["tied"], step=H, steps=20)
@@ -140,6 +141,7 @@ def exact(t, q, v, friction=0.0):
     [(dx.PlusLagrangeDirac(), 1), (dx.MinusLagrangeDirac("right"), 1), (dx.LagrangeDAlembert(), 2)],
     ids=["(+) left", "(−) right", "midpoint"],
 )
+@pytest.mark.soak_of("midpoint")
 def test_orders_and_the_momentum_map(scheme, order):
     errors = []
     for steps in (400, 800, 1600):
@@ -204,6 +206,7 @@ def test_the_midpoint_equations_are_those_of_the_geodesic_map_in_another_atlas()
     ("system", "scheme"),
     [("tied", dx.PlusLagrangeDirac()), ("free", dx.LagrangeDAlembert()), ("free", dx.DiscreteDirac(dx.SphereProjection()))],
 )
+@pytest.mark.soak_of("tied-scheme0")
 def test_starts_from_two_points(system, scheme):
     """Those of a run that starts from q and v give its other rows."""
     stated = TIED if system == "tied" else FREE

@@ -256,6 +256,7 @@ def test_compositions_of_variable_steps_have_their_order():
         (lambda: dx.VariableSteps(dx.Composition(dx.DiscreteDirac(), "suzuki4"), density), TypeError, "compose the variable"),
     ],
 )
+@pytest.mark.soak_of("<lambda>-ValueError-density must be positive0")
 def test_bad_input(scheme, error, words):
     with pytest.raises(error, match=words):
         dx.simulate(EXAMPLE.system, scheme(), step=0.1, steps=5, **RUN)

@@ -28,6 +28,7 @@ def pictures(path):
 
 
 @pytest.mark.parametrize("ending", ["gif", "webp"])
+@pytest.mark.soak_of("gif")
 def test_every_frame_is_another_picture_of_the_size_asked_for(tmp_path, ending):
     path = PENDULUM.animate(tmp_path / f"swing.{ending}", seconds=1, frames_per_second=5, size=(1.2, 1.0))
     found = list(pictures(path))

@@ -110,7 +110,9 @@ def test_a_file_is_kept_where_that_is_asked_for(sol, tmp_path):
 
 
 @pytest.mark.parametrize("name", gallery.names())
-@pytest.mark.soak_of("bicycle", "andrews-squeezer", "bricard", "flyball-governor", "n-four-bar", "n-trailer", "robot-arm")
+@pytest.mark.soak_of(
+    "bicycle", "andrews-squeezer", "four-bar", "bricard", "flyball-governor", "n-four-bar", "trikke", "n-trailer", "robot-arm"
+)
 def test_every_scene_of_the_gallery_has_places_of_the_right_shapes(name):
     example = gallery.get(name)
     row = {key: np.asarray(value, float) for key, value in example.initial.items() if key in ("q", "x")} | {"t": np.zeros(())}

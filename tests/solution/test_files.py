@@ -266,6 +266,7 @@ def test_schemes_of_dirax_survive_as_plain_data(scheme):
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
+@pytest.mark.soak_of(".nc")
 def test_long_attributes(ending, tmp_path, two_points):
     """HDF5 attributes end at 64 KB."""
     two_points = dx.load(two_points.save(tmp_path / f"run{ending}"))
@@ -450,6 +451,7 @@ def test_foreign_files(tmp_path):
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.9, 0.999])
+@pytest.mark.soak_of(but=["0.999"])
 def test_truncated_netcdf(share, tmp_path, batch):
     path = batch.save(tmp_path / "run.nc")
     content = path.read_bytes()
@@ -572,6 +574,7 @@ def rewritten(path, sol, **arrays):
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
+@pytest.mark.soak_of(".nc")
 def test_times_that_do_not_increase(ending, tmp_path, two_points):
     assert_same(dx.load(rewritten(tmp_path / f"good{ending}", two_points)), two_points)
     down, nan = two_points.t.copy(), two_points.t.copy()
@@ -622,6 +625,7 @@ def test_a_description_and_a_chunk_have_no_more_bytes_than_belong_there(tmp_path
 
 @pytest.mark.parametrize("ending", ENDINGS)
 @pytest.mark.parametrize("name", ["q", "time", "energy", "initial_v"])
+@pytest.mark.soak_of("q-.nc", "time-.nc", "energy-.nc", "initial_v-.nc")
 def test_numbers_of_another_type_are_not_taken_for_floats(name, ending, tmp_path, batch):
     """The same bytes as whole numbers have the same checksum: q was 4607182418800017408."""
     path = batch.save(tmp_path / f"run{ending}")
@@ -669,6 +673,7 @@ def test_sizes_are_read_before_numbers(tmp_path, batch):
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
+@pytest.mark.soak_of(".nc")
 def test_files_of_the_first_version(ending, tmp_path):
     """A batch of two skates, saved by dirax 0.1.0 through xarray."""
     path = FILES / "first.nc"
@@ -726,6 +731,7 @@ def test_long_arrays_go_through_chunks_and_compression(ending, tmp_path, monkeyp
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
+@pytest.mark.soak_of(".nc")
 def test_a_flipped_bit_anywhere_is_a_sentence_or_changes_nothing(ending, tmp_path, two_points):
     path = two_points.save(tmp_path / f"run{ending}")
     files = [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file())
@@ -751,6 +757,7 @@ def test_a_flipped_bit_anywhere_is_a_sentence_or_changes_nothing(ending, tmp_pat
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
+@pytest.mark.soak_of(".nc")
 def test_an_edited_description_is_noticed(ending, tmp_path, batch):
     path = batch.save(tmp_path / f"run{ending}")
     if ending == ".zarr":

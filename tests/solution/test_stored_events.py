@@ -12,7 +12,7 @@ WATCHED = [dx.Impact(lambda q: q[1]), dx.Event(lambda q: q[0] - 1.0)]
 
 @pytest.mark.parametrize("ending", [".zarr", ".nc"])
 @pytest.mark.parametrize("q", [[0.0, 1.0], [[0.0, 1.0], [0.0, 2.0]], [0.0, 1000.0]])
-@pytest.mark.soak_of("q0-.zarr")
+@pytest.mark.soak_of("q0-.zarr", "q0-.nc", "q1-.nc")
 def test_round_trip(tmp_path, ending, q):
     sol = dx.simulate(BALL, dx.LagrangeDAlembert(), q=q, v=[0.3, 0.0], step=0.05, steps=90, events=WATCHED)
     sol.save(tmp_path / f"run{ending}")

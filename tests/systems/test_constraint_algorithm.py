@@ -154,6 +154,7 @@ def test_phase_space_lagrangian_stops_at_the_graph_of_its_one_form():
     assert chain.field(chain.point)[:2] == pytest.approx([0.7 / 1.49, -0.4 / 1.49], abs=1e-12)
 
 
+@pytest.mark.soak
 def test_an_undetermined_coordinate_is_gauge_freedom():
     """L = (q̇_0 − q_1)²/2: p_1 = 0, then p_0 = 0, and q_1 is arbitrary."""
     chain = constraint_algorithm(dx.LagrangeDirac(lambda q, v: (v[0] - q[1]) ** 2 / 2), {"q": [0.1, 0.2], "v": [0.3, 0.4]})
@@ -215,6 +216,7 @@ def test_redundant_constraints_leave_a_multiplier_free_and_nothing_else():
     ],
     ids=["0 = 1", "hidden 0 = 1", "no real zero", "singular point", "double zero"],
 )  # fmt: skip
+@pytest.mark.soak_of("hidden 0 = 1")
 def test_what_goes_wrong_is_explained(E, f, near, verdict, words):
     chain = constraint_algorithm(ImplicitSystem(E, f), np.array(near))
     assert chain.verdict == verdict and words in chain.explanation
@@ -276,7 +278,7 @@ ROLLING = dx.DiracStructure.from_annihilator(lambda x: jnp.stack([-x[1], 0.0, 1.
 
 
 @pytest.mark.parametrize("near", [(0.001, 0.001, 0.001), (0.0, 0.0, 0.1), (0.3, 0.1, 0.2)])
-@pytest.mark.soak_of("near2")
+@pytest.mark.soak_of(but=["near0"])
 def test_a_pivot_that_vanishes_on_the_manifold_is_chosen_again(near):
     """dH ∥ (−y, 0, 1) and dH = x: M_0 is x = y = 0, where the entry −y of the one-form is zero."""
     chain = constraint_algorithm(dx.DiracSystem(ROLLING, lambda x: x @ x / 2), near=np.array(near))
@@ -380,6 +382,7 @@ def test_a_hessian_whose_kernel_turns_has_one_rank():
 
 
 @pytest.mark.parametrize("scheme", [dx.DiscreteDirac(constraints="resolve"), dx.Collocation(2)])
+@pytest.mark.soak_of("scheme0")
 def test_schemes_do_not_send_to_a_final_manifold_that_is_none(scheme):
     with pytest.raises(ValueError, match=r"is not found here: the rank of ∂²L/∂v² is 1 at the point and 2 around it"):
         dx.simulate(POLAR, scheme, q=[0.0, 0.2], v=[0.3, 0.5], step=0.1, steps=10)

@@ -149,6 +149,7 @@ def test_mistakes():
         run(dx.GeneralizedDiracSystem(CANONICAL, dx.LagrangianSubmanifold.from_hamiltonian(lambda x: x @ x)), x=np.ones(4))
 
 
+@pytest.mark.soak
 def test_matrices_of_no_dirac_structure():
     """They are refused where a run begins, and `verify` finds the place where they cease to be those of one."""
     of_energy = dx.LagrangianSubmanifold.from_hamiltonian(lambda x: x @ x / 2)

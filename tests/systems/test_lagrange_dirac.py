@@ -21,6 +21,7 @@ DEGENERATE = dx.LagrangeDirac(lambda q, v: (v[0] + v[1]) ** 2 / 2 - q[2] * v[2],
 
 @settings(max_examples=60)
 @given(vectors, vectors, st.floats(0.1, 10))
+@pytest.mark.soak
 def test_inverse_legendre_of_a_relativistic_particle(q, p, m):
     """p = m v/√(1 − v²); far out, Newton from v = 0 would leave |v| < 1."""
     v = inverse(jnp.array(q), jnp.array(p), m)
@@ -66,6 +67,7 @@ def test_the_nearest_velocity_of_a_degenerate_lagrangian(q, guess):
 nearest = jax.jit(DEGENERATE.inverse_legendre)
 
 
+@pytest.mark.soak
 def test_momenta_of_a_degenerate_lagrangian_are_completed_by_the_constraint():
     """v0 + v1 = 1.4 and v0 − 2 v1 + v2 = 0, of which the least-norm v2 is not zero."""
     data = {"q": jnp.array([0.0, 0.0, 0.5]), "p": jnp.array([1.4, 1.4, -0.5])}
