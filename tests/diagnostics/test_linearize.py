@@ -447,3 +447,12 @@ def test_chains_of_four_that_grow_by_powers_of_the_time_are_not_called_unstable(
         assert np.min(found.eigenvalues.real) == pytest.approx(-1 / 0.8, rel=1e-9)
         backward = forward | {"v": -np.array(forward["v"])}
         assert not dx.linearize(truck, backward).stable
+
+
+@pytest.mark.parametrize("scheme", [None, dx.LagrangeDAlembert()])
+def test_a_coordinate_without_mass_that_a_constraint_moves_is_no_singular_one(scheme):
+    system = dx.LagrangeDirac(lambda q, v: v[0] ** 2 / 2 - q[0] ** 2 / 2, lambda q: jnp.array([[1.0, -1.0]]))
+    step = {} if scheme is None else {"scheme": scheme, "step": 0.1}
+    found = dx.linearize(system, {"q": [0.0, 0.0], "v": [0.0, 0.0]}, **step)
+    frequency = 1.0 if scheme is None else 2 * np.arctan(0.05) / 0.1
+    np.testing.assert_allclose(np.sort(found.eigenvalues.imag), [-frequency, 0.0, frequency], atol=1e-9)

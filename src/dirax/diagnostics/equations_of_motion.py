@@ -87,16 +87,21 @@ def accelerations(system: LagrangeDirac, q: Any, v: Any, params: Any = None, t: 
     `ValueError` where the equations do not determine accelerations."""
     q, v = (np.asarray(values, float) for values in (q, v))
     equations, z, n = equations_of(system, t), np.concatenate([q, v]), q.size
-    w = _solved(equations, z, params)
-    by_w = np.asarray(evaluated(equations.by_w, z, w, params)[1])
-    rows, columns = _scales(by_w, n)
-    free = kernel(by_w / rows[:, None] / columns)[:n]
-    if np.max(np.abs(free), initial=0.0) > FREE:
+    if not determine(equations, z, params):
         raise ValueError(
             "the equations do not determine the accelerations: ∂²L/∂v² is singular at the data, as where a part has no mass. "
             'dx.constraint_algorithm(system, near={"q": …, "v": …}) finds the motions that there are.'
         )
+    w = _solved(equations, z, params)
     return w[:n], w[n:]
+
+
+def determine(equations: Equations, z: np.ndarray, params: Any) -> bool:
+    """Whether the equations at z = (q, v) determine the accelerations: ∂²L/∂v² is regular, or the constraints make it so."""
+    n = z.size // 2
+    by_w = np.asarray(evaluated(equations.by_w, z, _solved(equations, z, params), params)[1])
+    rows, columns = _scales(by_w, n)
+    return bool(np.max(np.abs(kernel(by_w / rows[:, None] / columns)[:n]), initial=0.0) <= FREE)
 
 
 def _solved(equations: Equations, z: Any, params: Any) -> np.ndarray:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from dirax.diagnostics.equations_of_motion import determine, equations_of
 from dirax.diagnostics.linearized_field import FieldAt, linearized_chain, linearized_lagrangian
 from dirax.diagnostics.linearized_step import linearized_step
 from dirax.numerics.eigenvalues import RANK, clusters, is_defective, with_errors
@@ -210,7 +211,8 @@ def _one_place(system: AbstractSystem, at: Mapping[str, Any], params: Any) -> tu
 
 
 def _is_singular(system: AbstractSystem, case: Case) -> bool:
-    """Whether ∂²L/∂v² is singular at the place. Raises `ValueError` where it is off the constraints, or no motion passes it."""
+    """Whether ∂²L/∂v² is singular at the place, and the constraints do not make it regular. Raises `ValueError` where the place
+    is off the constraints, or no motion passes it."""
     form = system.lagrangian_form()
     initial = completed(form, case, False)
     defect, size = np.ravel(initial.defect), np.ravel(initial.size)[: np.size(initial.defect)]
@@ -220,6 +222,8 @@ def _is_singular(system: AbstractSystem, case: Case) -> bool:
             f"{np.abs(defect).max():.3g}): a motion is linearized that keeps them."
         )
     if not is_singular(form, shape_of(form, *case.first), case, initial):
+        return False
+    if determine(equations_of(form, case.t0), np.concatenate([case.data["q"], case.data["v"]]), case.params):
         return False
     refuse_off_final_manifold(form, case, initial)
     return True
