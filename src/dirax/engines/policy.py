@@ -36,8 +36,11 @@ LARGEST_NATIVE = 192
 of 40, 64 and 96 take 2.0, 4.0 and 4.0 s instead of 5.3, 5.2 and 4.9, through a walking mechanism of nine coordinates by Method 2
 and by Lobatto's nodes, with 33 unknowns and more, 2.2 and 2.3 s instead of 17."""
 
-MOST_OPERATIONS = 10_000
-"""Scalar operations of a step that is sparse enough: a second of compiling, which 20 000 steps get back."""
+MOST_OPERATIONS = 30_000
+"""Scalar operations of a step of more unknowns. First call, and 1000 steps, natively and by the engine that takes it else: ten
+bobs on rods by Method 2, 13 809 operations, 3.9 s and .09 s (xla: 15 and 18 s), by Lobatto's nodes, 26 460, 3.1 and .04 (xla: 6.3
+and .7); a mesh of 25 points, 29 335, 2.3 and .02 (sparse: 4.7 and .1); first gradients in half the time. A lattice of 90 sites,
+44 775, takes 9.7 s to the first result, and the sparse engine 8.3."""
 
 # ---------------------------------------------------------------------------------------------- what "auto" gives to sparse
 
