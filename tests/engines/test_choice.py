@@ -22,7 +22,8 @@ def potential(differences):
 
 
 @pytest.mark.soak
-def test_sparse_steps_beyond_the_size_of_full_ones_are_native():
+def test_sparse_steps_beyond_the_size_of_full_ones_are_native(monkeypatch):
+    monkeypatch.setattr(choice, "MOST_OPERATIONS", 10_000)
     neighbours = dx.simulate(potential(jnp.diff), dx.LagrangeDAlembert(), **RUN)
     assert 2 * N > choice.LARGEST_FULL and neighbours.stats["engine"] == "native"
     pairs = dx.simulate(potential(lambda q: q[:, None] - q[None]), dx.LagrangeDAlembert(), **RUN)
