@@ -88,12 +88,18 @@ class Linearization:
         return "none grows exponentially, but some may grow like t" if self.defective else "stable"
 
     @property
+    def _groups(self) -> tuple[float, np.ndarray, np.ndarray, list[np.ndarray]]:
+        """The error of entries of the matrix, its eigenvalues with theirs, and the numbers of those that may be one."""
+        error = self.error * np.abs(self.matrix).max(initial=0.0)
+        values, errors = with_errors(self.matrix, error)
+        return error, values, errors, clusters(values, errors)
+
+    @property
     def defective(self) -> bool:
         """Whether eigenvalues that are one, to their error, have fewer eigenvectors than they are: then some small motions grow
         like t times what the eigenvalue says, as those of a free particle do at rest, q = v t."""
-        error = self.error * np.abs(self.matrix).max(initial=0.0)
-        values, errors = with_errors(self.matrix, error)
-        several = (np.mean(values[together]) for together in clusters(values, errors) if len(together) > 1)
+        error, values, _, groups = self._groups
+        several = (np.mean(values[together]) for together in groups if len(together) > 1)
         return any(is_defective(self.matrix, complex(value), error) for value in several)
 
     @property
@@ -109,9 +115,8 @@ class Linearization:
         number of the eigenvalue, but at most 1e-6 of the largest one. Eigenvalues that are one grow as their mean."""
         if not len(self.matrix):
             return True
-        error = self.error * np.abs(self.matrix).max()
-        values, errors = with_errors(self.matrix, error)
-        for together in clusters(values, errors):
+        error, values, errors, groups = self._groups
+        for together in groups:
             values[together] = np.mean(values[together])
         most = MULTIPLE * (np.abs(self.matrix) if self.step is None else np.abs(self.eigenvalues)).max()
         rates = np.real(values)

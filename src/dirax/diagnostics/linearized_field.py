@@ -49,18 +49,18 @@ def linearized_lagrangian(system: LagrangeDirac, at: Mapping[str, Any], generato
     """Of a Lagrangian with constraints, in z = (q, v)."""
     q, v = (np.asarray(at[name], float) for name in ("q", "v"))
     n, z, equations = q.size, np.concatenate([q, v]), equations_of(system, float(at.get("t", 0.0)))
-    w, derivative = linear(equations, z, params)
-    unmoved = derivative.copy()
+    w, unmoved = linear(equations, z, params)
+    derivative, flow = unmoved.copy(), np.concatenate([v, w[:n]])
     lifted, slopes = [], []
     for generator in generators:
-        value, slope, bend = (np.asarray(x) for x in evaluated(_lifts.get(generator, lambda g=generator: Lift(g)).at, q, v))
-        lifted.append(np.concatenate([value, slope @ v]))
+        moved, slope, bend = _lifted(generator, q, v)
+        lifted.append(moved)
         slopes.append((slope, bend))
     symmetric = np.stack(lifted, axis=1) if lifted else np.zeros((2 * n, 0))
     energy, forces, metric = (np.asarray(a) for a in evaluated(equations.sizes, q, v, w[n:], params))
     units, rate = _units(energy, forces, metric, v, derivative)
     tangent = _tangent(equations, z, params, units)
-    field, symmetric = np.concatenate([v, w[:n]]) / units / rate, symmetric / units[:, None]
+    field, symmetric = flow / units / rate, symmetric / units[:, None]
     if lifted:
         sizes = power_of_two(np.abs(symmetric).max(axis=0))
         symmetric = symmetric / sizes
@@ -77,7 +77,7 @@ def linearized_lagrangian(system: LagrangeDirac, at: Mapping[str, Any], generato
     if system.depends_on_time or (np.any(v) and not lifted):
         later = equations_of(system, equations.t + WHILE / rate) if system.depends_on_time else equations
         there = z if lifted else z + np.concatenate([v, np.zeros(n)]) * (WHILE / rate)
-        residual = max(residual, _changed(later, there, params, (np.concatenate([v, w[:n]]), unmoved, tangent, units, rate)))
+        residual = max(residual, _changed(later, there, params, (flow, unmoved, tangent, units, rate)))
     return FieldAt(scaled_matrix(derivative, units) / rate, tangent, symmetric, residual, units, rate)
 
 
@@ -93,8 +93,7 @@ def _refuse_no_symmetry(equations: Equations, z: np.ndarray, units: np.ndarray, 
     q, v = np.split(z + units * np.random.default_rng(z.size).uniform(0.2, 0.6, z.size), 2)
     by_q, by_v = (np.asarray(a) for a in evaluated(equations.slopes, q, v, params))
     for number, generator in enumerate(generators):
-        value, slope, _ = (np.asarray(a) for a in evaluated(_lifts.get(generator, lambda g=generator: Lift(g)).at, q, v))
-        moved, by = np.concatenate([value, slope @ v]), np.concatenate([by_q, by_v])
+        moved, by = _lifted(generator, q, v)[0], np.concatenate([by_q, by_v])
         terms, roundoff = by * moved, ROUNDOFF * (np.abs(by) @ units) * np.max(np.abs(moved) / units)
         if abs(np.sum(terms)) > max(NO_SYMMETRY * np.sum(np.abs(terms)), roundoff):
             raise ValueError(
@@ -168,6 +167,12 @@ class Lift:
 
 
 _lifts: Memo[Lift] = Memo(256)
+
+
+def _lifted(generator: Callable, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(ξ(q), Dξ(q) v) side by side, Dξ(q), and the derivative of Dξ(q) v by q."""
+    value, slope, bend = (np.asarray(x) for x in evaluated(_lifts.get(generator, lambda: Lift(generator)).at, q, v))
+    return np.concatenate([value, slope @ v]), slope, bend
 
 
 def linearized_chain(system: Any, at: Mapping[str, Any], params: Any) -> FieldAt:

@@ -161,19 +161,20 @@ class Interpreter:
             if isinstance(nodes, Held):
                 values.append(nodes.value)
                 continue
-            re, im = map(self._constant, nodes if isinstance(nodes, Pair) else (nodes, np.zeros(0, np.int64)))
-            if re is None or im is None:
+            if (value := self._value(nodes)) is None:
                 return None
-            values.append((re + 1j * im if isinstance(nodes, Pair) else re).astype(atom.aval.dtype))
+            values.append(value.astype(atom.aval.dtype))
         with jax.ensure_compile_time_eval():
             found = equation.primitive.bind(*values, **equation.params)
         results = found if equation.primitive.multiple_results else [found]
         return [self._of_known(value, equation) for value in results]
 
-    def _constant(self, nodes: Nodes) -> np.ndarray | None:
-        """The numbers of constant nodes, None when one is not constant."""
-        numbers = [self.graph.value[n] for n in nodes.ravel().tolist() if self.graph.is_constant(n)]
-        return None if len(numbers) < nodes.size else np.array(numbers, dtype=float).reshape(nodes.shape)
+    def _value(self, nodes: Nodes | Pair) -> np.ndarray | None:
+        """The array of constant nodes or of a pair of them, None when one is not constant."""
+        if isinstance(nodes, Pair):
+            re, im = map(self._value, nodes)
+            return None if re is None or im is None else re + 1j * im
+        return self.numbers(nodes) if nodes.size else np.zeros(nodes.shape)
 
     def _of_known(self, value: Any, equation: Any) -> Nodes | Unavailable:
         """The nodes of a concrete array, which is held where they do not hold it."""
