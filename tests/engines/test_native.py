@@ -626,3 +626,25 @@ def test_a_place_near_a_singular_jacobian_is_no_solution():
     missed = np.asarray(stage.residual(jnp.asarray(unknowns[0]), state, 0.0, h, None))
     assert not sol.ok
     assert not good[0] or np.max(np.abs(missed)) < 1e-6
+
+
+def test_matrices_whose_products_are_whole_numbers_but_for_roundoff():
+    """Harmonic modes through Hartley's matrix A, which is symmetric and orthogonal: entries of A K A differ from one another by
+    whole numbers over 16 and roundoff."""
+    n, steps, h = 16, 20, 0.3
+    angles = 2 * np.pi * np.outer(range(n), range(n)) / n
+    A, k = (np.cos(angles) + np.sin(angles)) / np.sqrt(n), np.arange(1.0, n + 1) ** 2
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - jnp.sum(k * (A @ q) ** 2) / 2)
+    q, w = np.linspace(-1, 1, n) ** 3 + 0.3, np.cos(np.arange(n))
+    rate = np.block([[np.zeros((n, n)), np.eye(n)], [-(A.T * k) @ A, np.zeros((n, n))]])
+    ahead, back = np.eye(2 * n) + h / 2 * rate, np.eye(2 * n) - h / 2 * rate
+    exact = np.linalg.matrix_power(np.linalg.solve(back, ahead), steps)[:n, :n]
+
+    def last(q):
+        sol = dx.simulate(system, dx.LagrangeDAlembert(), q=q, v=np.zeros(n), step=h, steps=steps, engine=native)
+        assert isinstance(q, jax.core.Tracer) or sol.stats["newton_iterations"] <= 2 * steps
+        return sol.q[-1]
+
+    np.testing.assert_allclose(last(q), exact @ q, atol=1e-12)
+    slope = jax.grad(lambda q: jnp.sum(jnp.sin(last(q))))(jnp.asarray(q)) @ w
+    np.testing.assert_allclose(slope, np.cos(exact @ q) @ (exact @ w), rtol=1e-9)

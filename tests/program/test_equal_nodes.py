@@ -28,6 +28,18 @@ def test_values_are_those_of_exact_arithmetic():
     assert sums == (a[0] * pow(a[1], -1, PRIME) + b[0] * pow(b[1], -1, PRIME)) % PRIME != tenths
 
 
+def test_roundoff_of_one_number_is_no_other_number():
+    """The powers of 2 modulo p are all numbers but zero: 2 has no smaller order, whatever prime divides p − 1."""
+    assert all(pow(2, (PRIME - 1) // factor, PRIME) != 1 for factor in (2, 165349, 4580250903341))
+    assert PRIME - 1 == 2 * 165349 * 4580250903341 and pow(2, PRIME - 1, PRIME) == 1
+    g, c = Graph(), lambda a: g.constant(float(a))
+    x = g.input("x")
+    found = values(
+        g, *(g.add(g.mul(x, c(k * 2.0**-61)), g.mul(x, c(-i / 16))) for i in range(16) for k in (0, *2.0 ** np.arange(-9, 3)))
+    )
+    assert len(set(found)) == 16 * 13
+
+
 def test_what_is_known_of_sines_and_what_is_not():
     g = Graph()
     x, y = g.input("x"), g.input("y")

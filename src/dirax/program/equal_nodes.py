@@ -1,7 +1,7 @@
 """Nodes that are equal as functions, found by their values modulo a prime, where arithmetic is exact.
 
 Second derivatives come out of a graph in either order, and mass matrices several times over: equal, but of other nodes. At a
-random point modulo p = 2⁶¹ − 1 two rational functions that differ have the same value with a probability of their degree over p
+random point modulo a prime p of 61 bits two rational functions that differ have the same value with a probability of their degree over p
 (Schwartz 1980, Zippel 1979), whatever their units are. A sine and the cosine of the same argument are a random point of the
 circle; of other functions it is known alone that they are equal where their arguments are.
 """
@@ -14,7 +14,9 @@ from operator import or_
 
 from dirax.program.graph import Graph
 
-PRIME = 2**61 - 1
+PRIME = 1514679813233062019
+"""The next after a number drawn at random of which 2 is a primitive root. Floats are whole numbers times powers of 2, and 2⁶¹ = 1
+modulo 2⁶¹ − 1: there the roundoff in 1 + 2⁻⁶² has the value of a number as large as 1."""
 
 TOTAL = frozenset(("add", "sub", "mul", "neg", "sin", "cos", "held", "ruled"))
 """Operations whose values are finite wherever their operands are: they bring no nan into what holds them."""
