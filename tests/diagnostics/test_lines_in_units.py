@@ -106,3 +106,14 @@ def test_steps_are_replayed_in_any_units(scheme):
         assert line.verdict == "ok" and line.value < 1e-15, line
         found.append(symplecticity(sol, None).verdict)
     assert len(set(found)) == 1
+
+
+def test_what_is_left_of_a_zero_is_not_a_form_that_changed():
+    """Six oscillators through the orthogonal matrix of the cosine transform: of AᵀA beside the diagonal roundoff is left, which
+    is all that these entries of the step's derivative have."""
+    k = np.arange(6)
+    A = np.sqrt(np.where(k == 0, 1, 2) / 6)[:, None] * np.cos(np.pi * k[:, None] * (k + 0.5) / 6)
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - jnp.sum((A @ q) ** 2) / 2)
+    q = np.linspace(-1, 1, 6) ** 3 + 0.3
+    line = symplecticity(dx.simulate(system, dx.LagrangeDAlembert(), q=q, v=np.zeros(6), step=0.1, steps=5), None)
+    assert line.verdict == "ok" and line.value is not None and line.value < 1e-15

@@ -53,8 +53,11 @@ def pulled_back(form: Array, jacobian: Array) -> Array:
 
 
 def with_sizes(change: Array, form: Array, jacobian: Array) -> Float[Array, "2 s s"]:
-    """The change of a form JᵀωJ, with the sizes |J|ᵀ|ω||J| of its terms."""
-    return jnp.stack([change, pulled_back(jnp.abs(form), jnp.abs(jacobian))])
+    """The change of a form JᵀωJ, with the sizes |J|ᵀ|ω||J| of its terms; of two directions no less than the geometric mean of
+    those of each with itself, since what is left of a zero in J has no size."""
+    sizes = pulled_back(jnp.abs(form), jnp.abs(jacobian))
+    lengths = jnp.sqrt(jnp.diagonal(sizes))
+    return jnp.stack([change, jnp.maximum(sizes, jnp.outer(lengths, lengths))])
 
 
 class CanonicalForm(RowForm):
