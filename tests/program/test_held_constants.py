@@ -113,3 +113,15 @@ def test_complex_numbers_on_the_way(potential, real):
         assert sol.stats["engine"] == "native"
         np.testing.assert_allclose(sol.q, run(real).q, rtol=0, atol=1e-13)
         assert dx.verify(sol).ok
+
+
+def test_gradients_with_complex_arrays_that_are_held():
+    """Whose parts are arrays of JAX, which makes them while it traces the run."""
+    turned = jnp.asarray(np.exp(1j * np.arange(3.0)))
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - jnp.abs(turned @ q.astype(complex)) ** 2)
+
+    def last(q, engine):
+        return jnp.sum(dx.simulate(system, dx.LagrangeDAlembert(), q=q, v=0 * q, step=0.1, steps=3, engine=engine).q[-1] ** 2)
+
+    q = jnp.array([0.1, -0.2, 0.4])
+    np.testing.assert_allclose(jax.grad(last)(q, "native"), jax.grad(last)(q, "xla"), rtol=1e-12)

@@ -4,6 +4,7 @@ import warnings
 
 import jax
 import jax.numpy as jnp
+import mpmath
 import numpy as np
 import pytest
 from jax.extend.core import ClosedJaxpr
@@ -11,6 +12,7 @@ from jax.extend.core import ClosedJaxpr
 import dirax as dx
 import dirax.program.rules
 from dirax.engines.native.ir.compiled_function import compiled
+from dirax.program import pairs
 from dirax.program.evaluation.functions import in_numpy
 from dirax.program.graph import Graph
 from dirax.program.graph_derivatives import jacobian
@@ -415,3 +417,11 @@ def test_whole_numbers_that_are_known_late_are_divided_towards_zero():
 
     found = in_numpy(quotients, [np.array([[2.0], [-3.0]])], "quotients")
     np.testing.assert_array_equal(found, np.stack([quotients(jnp.array([x])) for x in (2.0, -3.0)]))
+
+
+@pytest.mark.parametrize("z", [-1 + 1e-9j, -0.7 - 0.3j, 1e-12 + 1e-13j, -2 + 1e-20j])
+def test_the_logarithm_of_one_and_a_complex_number(z):
+    with mpmath.workdps(40):
+        exact = complex(mpmath.log(1 + mpmath.mpmathify(z)))
+    found = pairs.log1p(pairs.Pair(z.real, z.imag))
+    np.testing.assert_allclose([float(found.re), float(found.im)], [exact.real, exact.imag], rtol=1e-15)

@@ -1,9 +1,9 @@
 """Nodes that are equal as functions, found by their values modulo a prime, where arithmetic is exact.
 
 Second derivatives come out of a graph in either order, and mass matrices several times over: equal, but of other nodes. At a
-random point modulo a prime p of 61 bits two rational functions that differ have the same value with a probability of their degree over p
-(Schwartz 1980, Zippel 1979), whatever their units are. A sine and the cosine of the same argument are a random point of the
-circle; of other functions it is known alone that they are equal where their arguments are.
+random point modulo a prime p of 61 bits two rational functions that differ have the same value with a probability of their
+degree over p (Schwartz 1980, Zippel 1979), whatever their units are. A sine and the cosine of the same argument are a random
+point of the circle; of other functions it is known alone that they are equal where their arguments are.
 """
 
 import math

@@ -107,7 +107,8 @@ class Interpreter:
         known = isinstance(value, jax.Array | np.ndarray | np.generic)
         dtype = value.dtype if known else np.asarray(value).dtype
         if dtype == np.complex128:
-            return Pair(*map(self.constants, (np.real(value), np.imag(value))))
+            whole = np.asarray(value)  # the parts of an array of JAX are made by JAX, which may be tracing
+            return Pair(self.constants(whole.real), self.constants(whole.imag))
         if not is_held_by_nodes(dtype) and dtype not in SHORT:
             failure = UnsupportedPrimitive("constant", f"has dtype {dtype}", "a captured array")
             return Held(value, failure) if known else Unavailable(failure)
