@@ -13,7 +13,7 @@ from dirax.engines.step_program import linearized
 from dirax.program import scalar_program
 from dirax.program.evaluation import in_numpy as module
 from dirax.program.evaluation.functions import in_numpy, program_of
-from dirax.program.linear_solves import pseudo_inverse, pseudo_inverses, scaled_pseudo_inverse, solve
+from dirax.program.linear_solves import LARGE, equilibrated_inverse, pseudo_inverse, pseudo_inverses, scaled_pseudo_inverse, solve
 from dirax.program.roots import nearest_root
 from dirax.program.rules import by_numpy
 from dirax.schemes.step import Shape, make_step_equation
@@ -146,6 +146,22 @@ def test_pseudo_inverses_side_by_side_are_those_of_each(shape):
         size = np.max(np.abs(matrix), initial=0.0) or 1.0
         assert mine.shape == shape[::-1]
         np.testing.assert_allclose(size * mine, np.linalg.pinv(matrix / size, 1e-12), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("rank", [LARGE, LARGE - 1])
+def test_large_pseudo_inverses_by_jax(rank):
+    """Without singular values where there surely are no small ones."""
+    random = np.random.default_rng(5)
+    left, right = (np.linalg.qr(random.normal(size=(LARGE, LARGE)))[0] for _ in range(2))
+    matrix = (left[:, :rank] * np.linspace(1, 2, rank)) @ right[:, :rank].T
+    found, units = jax.jit(lambda a: equilibrated_inverse(jnp, a, 1e-9))(matrix)
+    inverse = (right[:, :rank] / np.linspace(1, 2, rank)) @ left[:, :rank].T
+    if rank == LARGE:
+        np.testing.assert_allclose(found, inverse, atol=1e-13)
+    else:  # the smallest in units of the unknowns
+        right_side = matrix @ np.ones(LARGE)
+        np.testing.assert_allclose(matrix @ (found @ right_side), right_side, atol=1e-12)
+        assert np.linalg.norm(found @ right_side / units) < np.linalg.norm(inverse @ right_side / units) * (1 + 1e-12)
 
 
 @pytest.mark.parametrize(("name", "by"), [("a root", "damped_step"), ("a pseudo-inverse", "pseudo_inverses")])

@@ -15,8 +15,11 @@ KEPT = 96
 """Functions kept in memory: a run on the xla engine has one, whose executable takes 130 memory maps and four megabytes or more,
 of the 65 530 maps that a process may have."""
 
-SELDOM = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 0}
-"""With these, code for a CPU takes a fourth of the time to compile, and half as long again to run."""
+SELDOM = {
+    "xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 0, "xla_disable_hlo_passes": "constant_folding",
+}  # fmt: skip
+"""With these, code for a CPU takes a fourth of the time to compile, and half as long again to run; and what is made of a large
+matrix that functions close over is not found by XLA's interpreter, which takes 15 s for the inverse of one of 800 rows."""
 
 _jitted: Memo[Callable] = Memo(KEPT)
 

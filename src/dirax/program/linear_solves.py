@@ -20,6 +20,9 @@ from dirax.program.primitives import binds, each, plain_primitive
 SURELY_REGULAR = 1e6
 """Condition number, by the largest sums of rows, up to which no singular value of a matrix may count as zero."""
 
+LARGE = 128
+"""Rows from which on XLA looks for that, too: singular values of 2000 rows take a minute, and an inverse a second."""
+
 
 def solve(matrix: Float[Array, "n n"], right: Array, apart: bool = False) -> Array:
     """`jnp.linalg.solve` of a matrix (n, n) and a right-hand side (n,) or (n, k).
@@ -60,9 +63,19 @@ def equilibrated_inverse(xp: ModuleType, matrix: Any, tolerance: float = EQUATIO
     sizes = xp.abs(lax.stop_gradient(matrix) if xp is jnp else matrix)  # units have no derivative, which would be ∞ at zero
     rows, columns = balancing_scales(sizes, xp)
     scaled = matrix / rows / columns
-    inverse = xp.linalg.pinv(scaled, tolerance) if xp is jnp else pseudo_inverses(scaled, tolerance, _by_either_scale)
+    inverse = _of_one(scaled, tolerance) if xp is jnp else pseudo_inverses(scaled, tolerance, _by_either_scale)
     turned = lambda a: xp.swapaxes(a, -1, -2)
     return inverse / turned(columns) / turned(rows), 1.0 / columns[..., 0, :]
+
+
+def _of_one(matrix: Array, tolerance: float) -> Array:
+    """The pseudo-inverse of one matrix by JAX: of a large square one as `pseudo_inverses` has it."""
+    k, l = matrix.shape
+    if k != l or k < LARGE:
+        return jnp.linalg.pinv(matrix, tolerance)
+    inverse, size = jnp.linalg.inv(matrix), lambda a: jnp.max(jnp.sum(jnp.abs(a), axis=1))
+    regular = size(matrix) * size(inverse) <= SURELY_REGULAR
+    return lax.cond(regular, lambda: inverse, lambda: jnp.linalg.pinv(matrix, tolerance))
 
 
 def pseudo_inverses(matrices: np.ndarray, tolerance: float, of_doubtful: Callable = np.linalg.pinv) -> np.ndarray:

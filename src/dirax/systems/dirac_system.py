@@ -87,12 +87,19 @@ class DiracSystem(AbstractSystem):
         differential: Float[Numbers, " N"] | None = None,
     ) -> Float[Numbers, " k"]:
         """F ẋ + E (dH − Gᵀλ), zero iff (ẋ, dH − Gᵀλ) ∈ D_x, and G ẋ; `differential` replaces dH(x)."""
-        F, E = self.structure.kernel(x, params)
         dh = self.differential(x, params) if differential is None else differential
         if self.holonomic is None:
-            return jnp.asarray(F @ velocity + E @ dh)
+            return self._defect(x, velocity, dh, params)
         rows = self.holonomic_matrix(x, params)
-        return jnp.concatenate([F @ velocity + E @ (dh - rows.T @ multipliers), rows @ velocity])
+        return jnp.concatenate([self._defect(x, velocity, dh - rows.T @ multipliers, params), rows @ velocity])
+
+    def _defect(self, x, velocity, covector, params):
+        """F ẋ + E α, zero iff (ẋ, α) ∈ D_x."""
+        if self.canonical:
+            of_q, of_p = jnp.split(velocity, 2)
+            return jnp.concatenate([-of_p, of_q]) - covector
+        F, E = self.structure.kernel(x, params)
+        return jnp.asarray(F @ velocity + E @ covector)
 
     def relation_form(self, shape: Shape) -> RelationForm:
         labels = tuple(f"rate of constraint {a}" for a in range(len(shape.kept)))
@@ -252,10 +259,11 @@ class DiracSystem(AbstractSystem):
         out = self.hamiltonian.shape(x, params)
         if out.shape != ():
             raise ValueError(f"hamiltonian must return a scalar, but for x of shape {x.shape} it returned shape {out.shape}.")
-        F, _ = jax.eval_shape(lambda x: self.structure.kernel(x, params), x)
-        if F.shape != (x.size, x.size):
+        kernel = lambda x: self.structure.kernel(x, params)[0]
+        dimension = self.structure.n if self.canonical else jax.eval_shape(kernel, x).shape[0]
+        if dimension != x.size:
             raise ValueError(
-                f"the Dirac structure has dimension {F.shape[0]}, but x has {x.size} entries"
+                f"the Dirac structure has dimension {dimension}, but x has {x.size} entries"
                 + (f": {self.structure.ports} ports are open; connect them by `compose`." if self.structure.ports else ".")
             )
         return (x.size, 0) if self.holonomic is None else (x.size, *self.constraints.sizes(x, params))
@@ -264,8 +272,10 @@ class DiracSystem(AbstractSystem):
     def premise_everywhere(self) -> bool:
         return True
 
-    def premise(self, data: Data, params: Any) -> Premise:
+    def premise(self, data: Data, params: Any) -> Premise | None:
         """The matrices are those of a Dirac structure."""
+        if self.canonical:
+            return None
         of_structure = KERNEL_PAIRS[self.structure.representation]
         return Premise(self._structure_matrices, lambda matrices: of_structure(*matrices))
 
@@ -327,7 +337,7 @@ class DiracSystem(AbstractSystem):
         if self.holonomic is not None and self.is_graph:
             return sizes
         rates = of_solution(
-            self._rates(x, params)[0], jnp.concatenate([data["velocity"], data["multipliers"]]), tolerance=RATE_RANK
+            lambda: self._rates(x, params)[0], jnp.concatenate([data["velocity"], data["multipliers"]]), tolerance=RATE_RANK
         )
         return sizes | {"velocity": rates[: x.shape[0]], "multipliers": rates[x.shape[0] :]}
 
@@ -354,6 +364,9 @@ class DiracSystem(AbstractSystem):
     def constraint_sizes_at(self, row: Data, params: Any) -> Float[Numbers, " k"]:
         """The terms of F ẋ + E dH: those of a two-form cancel, and are as large as it is."""
         x = row["x"]
+        velocity = jnp.abs(self.complete({"x": x}, params, False)["velocity"])
+        covector = jnp.abs(self.differential(x, params))
+        if self.canonical:
+            return jnp.roll(velocity, x.shape[0] // 2) + covector
         F, E = (jnp.abs(jnp.asarray(a)) for a in self.structure.kernel(x, params))
-        velocity = self.complete({"x": x}, params, False)["velocity"]
-        return F @ jnp.abs(velocity) + E @ jnp.abs(self.differential(x, params))
+        return F @ velocity + E @ covector

@@ -158,7 +158,7 @@ class GeneralizedDiracSystem(AbstractSystem):
         N, both, found = x.shape[0], jnp.concatenate([x, s]), jnp.concatenate([data["velocity"], s])
         slope = gradient(lambda z: self.submanifold.family(z[:N], z[N:], params))
         energetic = as_large_as_energy(slope, both)
-        solved = of_solution(jacobian(lambda u: self.relation(x, u[:N], u[N:], 0.0, params))(found), found)
+        solved = of_solution(lambda: jacobian(lambda u: self.relation(x, u[:N], u[N:], 0.0, params))(found), found)
         sizes = {name: jnp.abs(a) for name, a in data.items()}
         return sizes | {"x": sizes["x"] + energetic[:N], "velocity": solved[:N], "guess": solved[N:] + energetic[N:]}
 

@@ -98,7 +98,7 @@ class ImplicitSystem(AbstractSystem):
         if self.hamiltonian is not None:
             largest = largest + as_large_as_energy(gradient(lambda x: self.hamiltonian(x, params)), x)
         terms = jnp.abs(jacobian(lambda x: self.equations(x, params)[1])(x)) @ largest if x.size <= MOST else None
-        rates = of_solution(self.equations(x, params)[0], solution, terms)
+        rates = of_solution(lambda: self.equations(x, params)[0], solution, terms)
         sizes = {name: jnp.abs(a) for name, a in data.items()}
         return sizes | {"x": largest, "velocity": rates[: x.size], "multipliers": rates[x.size :]}
 

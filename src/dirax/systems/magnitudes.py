@@ -40,13 +40,13 @@ def as_large_as_energy(slope: Callable, x: Float[Numbers, " n"]) -> Float[Number
 
 
 def of_solution(
-    matrix: Float[Numbers, "k l"], solution: Float[Numbers, " l"], right: Any = None, tolerance: float = EQUATION_RANK
+    matrix: Callable, solution: Float[Numbers, " l"], right: Any = None, tolerance: float = EQUATION_RANK
 ) -> Float[Numbers, " l"]:
-    """The sizes of the unknowns of linear equations that `scaled_inverse` solved: those that are zero come out as roundoff of
-    the others, in the units in which it was found, and of the terms of the sizes `right` (k,) that their right-hand sides have;
-    of many in one unit."""
+    """The sizes of the unknowns of linear equations of a `matrix()` (k, l) that `scaled_inverse` solved: those that are zero come
+    out as roundoff of the others, in the units in which it was found, and of the terms of the sizes `right` (k,) that their
+    right-hand sides have; of many, for which no matrix is made, in one unit."""
     if solution.size > MOST:
         return jnp.abs(solution) + SOLVED_ROUNDOFF * jnp.max(jnp.abs(solution), initial=0.0)
-    inverse, units = scaled_inverse(matrix, tolerance)
+    inverse, units = scaled_inverse(matrix(), tolerance)
     of_right = 0.0 if right is None else jnp.abs(inverse) @ right
     return jnp.abs(solution) + SOLVED_ROUNDOFF * (units * jnp.max(jnp.abs(solution) / units, initial=0.0) + of_right)
