@@ -24,6 +24,7 @@ def potential(differences):
 @pytest.mark.soak
 def test_sparse_steps_beyond_the_size_of_full_ones_are_native(monkeypatch):
     monkeypatch.setattr(choice, "MOST_OPERATIONS", 10_000)
+    monkeypatch.setattr(choice, "MOST_NOT_SPARSE", 10_000)
     neighbours = dx.simulate(potential(jnp.diff), dx.LagrangeDAlembert(), **RUN)
     assert 2 * N > choice.LARGEST_FULL and neighbours.stats["engine"] == "native"
     pairs = dx.simulate(potential(lambda q: q[:, None] - q[None]), dx.LagrangeDAlembert(), **RUN)
@@ -37,6 +38,19 @@ def test_too_large_a_step_says_its_size():
     size = choice.LARGEST_NATIVE // 2 + 1
     large = dx.simulate(potential(jnp.diff), dx.LagrangeDAlembert(), q=np.zeros(size), v=np.ones(size), step=0.01, steps=1)
     assert large.stats["engine"] == "sparse" and large.stats["not_native"] == f"{2 * size} numbers a step, more than 192"
+
+
+def test_a_large_step_that_is_not_sparse_is_native(monkeypatch):
+    """Of more numbers than such as are sparse may have."""
+    monkeypatch.setattr(choice, "LARGEST_NATIVE", 2 * N - 2)
+    all_of_all = dx.LagrangeDirac(lambda q, v: v @ v / 2 - jnp.cos(jnp.sum(q)) - q @ q)
+    sol = dx.simulate(all_of_all, dx.LagrangeDAlembert(), **RUN)
+    assert sol.stats["engine"] == "native" and "not_native" not in sol.stats
+    monkeypatch.setattr(choice, "LARGEST_SCALARS", 2 * N - 1)
+    dx.clear_caches()
+    again = dx.simulate(all_of_all, dx.LagrangeDAlembert(), **RUN)
+    assert again.stats["engine"] == "xla" and again.stats["not_native"] == f"{2 * N} numbers a step, more than {2 * N - 1}"
+    np.testing.assert_allclose(sol.q, again.q, rtol=1e-12)
 
 
 @pytest.mark.parametrize("nested", [False, True])

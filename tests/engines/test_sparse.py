@@ -1,7 +1,5 @@
 """The sparse engine beside the dense one: rows, multipliers, derivatives, batches; what is said of large systems that fail."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +7,7 @@ import pytest
 import scipy.sparse as sp
 
 import dirax as dx
-from dirax.engines.auto import Auto
+from dirax.engines.auto import in_turn
 from dirax.engines.contract import Problem
 from dirax.engines.sparse.engine import Sparse
 from dirax.gallery import hanging_chain
@@ -137,6 +135,7 @@ def test_auto_takes_it_where_it_is_quicker(monkeypatch):
     assert min(parts) > 0 and abs(sum(parts) - sol.stats["run_seconds"]) < 1e-9
     coupled = dx.LagrangeDirac(lambda q, v: v @ v / 2 - jnp.sum(jnp.cos(q[:, None] - q[None, :])))
     run |= {"q": WAVE, "v": 0 * WAVE}
+    monkeypatch.setattr("dirax.engines.policy.MOST_NOT_SPARSE", 1000)
     with monkeypatch.context() as patch, pytest.raises(ValueError, match="a step of 36 unknowns that is not sparse"):
         patch.setattr("dirax.engines.policy.LARGEST_DENSE", 35)
         dx.simulate(coupled, dx.LagrangeDAlembert(), **run)
@@ -290,7 +289,8 @@ def test_it_says_why_it_does_not_take_a_step():
     state = np.zeros(2 * size)
     problem = Problem(equation, state, (state[:size],), 0.1, 0.0, 2)
     assert "depend on too many unknowns" in (Sparse().supports(problem) or "")
-    assert isinstance(Auto()._by_arrays(dataclasses.replace(problem))[1]["not_sparse"], str)
+    notes: dict[str, str] = {}
+    assert [engine.name for engine in in_turn(problem, notes)] == ["xla"] and "depend on too many" in notes["not_sparse"]
 
 
 @pytest.mark.soak
@@ -345,3 +345,17 @@ def test_levels_of_a_program_with_choices():
         np.testing.assert_allclose(f(np.array(values)), np.array(expected, float), rtol=1e-15)
     slope = jax.jacfwd(f)(np.array([0.3, 0.7, 0.9]))
     np.testing.assert_allclose(slope[0], [0.0, 0.0, np.cos(0.9)], atol=1e-15)
+
+
+def test_canonical_dirac_systems_make_no_matrices():
+    """ẋ ⊕ dH ∈ D of 3000 sites, whose two-form has 36 million entries."""
+    n = 3000
+    H = lambda x: jnp.sum(x[n:] ** 2) / 2 + jnp.sum(1 - jnp.cos(jnp.diff(x[:n])))
+    q = np.sin(np.arange(n) / 200)
+    run = {"step": 0.05, "steps": 3}
+    sol = dx.simulate(dx.DiracSystem(dx.induced_dirac(None, n), H), dx.DiscreteDirac(), x=np.r_[q, 0 * q], **run)
+    assert sol.stats["by_sites"] and sol.stats["bandwidth"][0] < 10
+    chain = dx.HamiltonDirac(lambda q, p: H(jnp.concatenate([q, p])))
+    np.testing.assert_allclose(sol.x[:, :n], dx.simulate(chain, dx.DiscreteDirac(), q=q, p=0 * q, **run).x[:, :n], atol=1e-13)
+    with pytest.raises(ValueError, match="dimension 6000, but x has 6 entries"):
+        dx.simulate(dx.DiracSystem(dx.induced_dirac(None, n), lambda x: x @ x), dx.DiscreteDirac(), x=np.zeros(6), **run)

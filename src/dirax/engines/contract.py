@@ -43,6 +43,11 @@ Progress = Callable[[int, int], None]
 """Called with (steps done, steps in all)."""
 
 
+def size_of(equation: Any) -> int:
+    """The most unknowns of a stage of a step, or entries of its state."""
+    return max(max(stage.unknowns, stage.state_size) for stage, _ in equation.stages)
+
+
 @dataclass(frozen=True)
 class Problem:
     """A run: an equation (or a sequence of them), where it starts, and what is to be saved.
@@ -78,8 +83,8 @@ class Problem:
 
     @property
     def size(self) -> int:
-        """The most unknowns of a stage, or entries of the state."""
-        return max(max(stage.unknowns, stage.state_size) for stage, _ in self.equation.stages)
+        """`size_of` its equation."""
+        return size_of(self.equation)
 
     @property
     def rows(self) -> int:

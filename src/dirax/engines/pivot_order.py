@@ -126,11 +126,14 @@ def _order_on_diagonal(there: np.ndarray, signs: list[int] | None, values: np.nd
 
 
 def _samples(g: Graph, matrix: list[list[int]]) -> np.ndarray:
+    """The values (SAMPLES, k, k) of the entries."""
     k, random = len(matrix), np.random.default_rng(20230331)
-    flat = [entry for row in matrix for entry in row]
-    names = sorted(str(g.value[n]) for n in g.reachable(flat) if g.op[n] == "input")
+    flat = np.array(matrix, np.int64).ravel()
+    entries, number = np.unique(flat, return_inverse=True)
+    names = sorted(str(g.value[n]) for n in g.reachable(entries.tolist()) if g.op[n] == "input")
     points = {name: random.uniform(0.3, 1.7, SAMPLES) for name in names}
     points["h"] = np.full(SAMPLES, 0.01)
     with np.errstate(all="ignore"):
-        columns = g.evaluate(flat, points)
-    return np.stack([np.broadcast_to(np.asarray(c, dtype=float), SAMPLES) for c in columns], axis=1).reshape(SAMPLES, k, k)
+        columns = g.evaluate(entries.tolist(), points)
+    values = np.stack([np.broadcast_to(np.asarray(c, dtype=float), SAMPLES) for c in columns], axis=1)
+    return values[:, number].reshape(SAMPLES, k, k)

@@ -42,6 +42,11 @@ bobs on rods by Method 2, 13 809 operations, 3.9 s and .09 s (xla: 15 and 18 s),
 and .7); a mesh of 25 points, 29 335, 2.3 and .02 (sparse: 4.7 and .1); first gradients in half the time. A lattice of 90 sites,
 44 775, takes 9.7 s to the first result, and the sparse engine 8.3."""
 
+LARGEST_SCALARS, MOST_NOT_SPARSE = 384, 60_000
+"""Both for a step that the sparse engine leaves. First call, and 1000 steps, natively and by XLA: twenty bobs on rods by Method
+2, 300 unknowns and 29 297 operations, 5 s and .34 s (5.3 and 4.2), fifteen by Lobatto's nodes, 40 973, 3.3 and .06 (4.8 and 30);
+14 bodies that attract each other, 50 451, 2.5 and .06 (2.2 and .46); first gradients in half the time."""
+
 # ---------------------------------------------------------------------------------------------- what "auto" gives to sparse
 
 FEWEST_SPARSE = 33
@@ -100,15 +105,17 @@ def engine_of(name: str, **options: Any) -> AbstractEngine:
     return getattr(import_module(module), kind)(**options)
 
 
-def kept_from_native(problem: Problem, traced: bool = False) -> str | None:
-    """Why "auto" does not ask the native engine, where it does not. Derivatives of collocation are by all its nodes at once."""
+def kept_from_native(problem: Problem, traced: bool, not_sparse: bool) -> str | None:
+    """Why "auto" does not ask the native engine, where it does not, before the sparse engine is asked or, `not_sparse`, after it.
+    Derivatives of collocation are by all its nodes at once."""
     full = traced and any(stage.collocation is not None for stage, _ in problem.equation.stages)
-    return _larger_than(LARGEST_FULL if full else LARGEST_NATIVE, problem, traced) or _other_device()
+    largest = LARGEST_FULL if full else LARGEST_SCALARS if not_sparse else LARGEST_NATIVE
+    return _larger_than(largest, problem, traced) or _other_device()
 
 
-def most_operations(problem: Problem) -> int | None:
+def most_operations(problem: Problem, not_sparse: bool) -> int | None:
     """Scalar operations of a step up to which "auto" takes the native engine; None for any number."""
-    return None if problem.size <= LARGEST_FULL else MOST_OPERATIONS
+    return None if problem.size <= LARGEST_FULL else MOST_NOT_SPARSE if not_sparse else MOST_OPERATIONS
 
 
 def most_traced(array_operations: float) -> int:

@@ -33,7 +33,7 @@ import numpy as np
 from dirax.engines.close_sizes import MOST, Entries, close_sizes, sizes_at
 from dirax.engines.contract import Problem
 from dirax.engines.first_sizes import FAR, first_sizes
-from dirax.engines.policy import LARGEST_NATIVE
+from dirax.engines.policy import LARGEST_NATIVE, LARGEST_SCALARS
 from dirax.engines.step_program import step_program
 from dirax.engines.steps_in_numbers import StepsInNumbers
 from dirax.numerics.equilibration import power_of_two
@@ -50,7 +50,7 @@ Sizes = tuple[Any, ...]
 
 def sizes_of(problem: Problem) -> Sizes:
     """The sizes of the unknowns of each stage, (k,) or (B, k), of a problem in numbers."""
-    if problem.size > LARGEST_NATIVE:
+    if _is_large(problem):
         return _of_many(problem)
     return _in_numbers(problem, _start(problem), _looked_at)
 
@@ -58,7 +58,7 @@ def sizes_of(problem: Problem) -> Sizes:
 def sizes_of_traced(problem: Problem) -> Sizes:
     """The same of a problem that JAX traces, without derivatives: in numbers when it runs, where the step has a scalar program,
     since XLA takes seconds to compile them."""
-    if problem.size > LARGEST_NATIVE:
+    if _is_large(problem):
         return _of_many(problem, traced=True)
     found = _on_host(problem)
     if found is None:
@@ -103,7 +103,7 @@ def _is_known(unknowns: tuple, sizes: Sizes) -> np.ndarray:
 def _next_step(p: Problem, lanes: np.ndarray, completed: np.ndarray, state: np.ndarray, guess: tuple) -> tuple[tuple, Any]:
     """The unknowns of each stage in the step that leaves `state`, and where it has a solution; of steps that cannot be taken in
     numbers the guess."""
-    steps = StepsInNumbers.found(p.equation, p.params, p.batch_params) if p.size <= LARGEST_NATIVE else None
+    steps = StepsInNumbers.found(p.equation, p.params, p.batch_params) if not _is_large(p) else None
     if steps is None:
         return guess, np.ones(len(lanes), bool)
     params = steps.parameters(p.params, p.batch if p.batch_params else None, lanes)
@@ -114,12 +114,23 @@ def _next_step(p: Problem, lanes: np.ndarray, completed: np.ndarray, state: np.n
 def sizes_there(problem: Problem, lanes: np.ndarray, completed: np.ndarray, state: np.ndarray, guess: tuple) -> Sizes:
     """The sizes of some trajectories where they stand, looked at closely; arguments as above."""
     p = problem
-    if p.size > LARGEST_NATIVE:
+    if _is_large(p):
         return tuple(np.ones((len(lanes), np.shape(u)[-1])) for u in guess)
     moved = lambda a: np.asarray(a)[lanes] if p.batch is not None else np.asarray(a)[None][lanes]
     params = jax.tree.map(moved, p.params) if p.batch_params else p.params
     here = dataclasses.replace(p, state=state, guess=guess, params=params, batch=len(lanes))
     return _in_numbers(here, p.t0 + (p.first_step + completed) * p.h, _closely)
+
+
+def _is_large(p: Problem) -> bool:
+    """Whether sizes would take long in numbers: there are very many unknowns, or many and no scalar program."""
+    if not LARGEST_NATIVE < p.size <= LARGEST_SCALARS:
+        return p.size > LARGEST_SCALARS
+    try:
+        step_program(p.equation, p.params, p.batch_params)
+    except UnsupportedPrimitive:
+        return True
+    return False
 
 
 def _start(p: Problem) -> Any:

@@ -16,7 +16,7 @@ import numpy as np
 
 from dirax.engines.contract import Problem
 from dirax.engines.linear_solver import AbstractLinearSolver
-from dirax.engines.sparse.plan import sparse_plan
+from dirax.engines.sparse.plan import quicker_plan
 from dirax.engines.sparse.solver import SparseSolver
 from dirax.engines.xla.dense import Dense
 from dirax.numerics.equilibration import power_of_two
@@ -43,9 +43,9 @@ LARGEST_DENSE = 2**24
 def sizes_of_many(p: Problem, traced: bool = False) -> tuple[Any, ...]:
     """The sizes of the unknowns of each stage, (k,) or (B, k); 1 where the Jacobian is neither sparse nor small enough. `traced`:
     of a problem that JAX traces, whose equation may close over what is traced."""
-    plan = None if jax.default_backend() != "cpu" else sparse_plan(p.equation, p.params, p.batch_params)
+    plan = None if jax.default_backend() != "cpu" else quicker_plan(p.equation, p.params, p.batch_params)
     equation, solvers = p.equation, (None,) * len(p.equation.stages)
-    if isinstance(plan, tuple) and not plan.solvers[0].equations.slower:
+    if isinstance(plan, tuple):
         equation, solvers = plan.equation, plan.solvers
     elif max(stage.unknowns for stage, _ in p.equation.stages) ** 2 > LARGEST_DENSE:
         return tuple(jnp.ones(np.shape(guess)) for guess in p.guess)

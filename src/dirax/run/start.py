@@ -87,15 +87,15 @@ def begun(equation: Any, case: Case, initial: Initial, by_jax: bool = False) -> 
 
 def _with_sparse_first_step(equation: Any, case: Case, start: Start) -> Start:
     """The start with the first step's Jacobian as a sparse one, or a dense one where it is not too large."""
-    from dirax.engines.sparse.plan import Unsolvable, sparse_plan  # imported when it is used
+    from dirax.engines.sparse.plan import Unsolvable, quicker_plan  # imported when it is used
 
-    plan = sparse_plan(equation, case.params, case.batch_params)
+    plan = quicker_plan(equation, case.params, case.batch_params)
     if isinstance(plan, Unsolvable):
         raise ValueError(
             f"the first step has no unique solution, whatever the initial data: {plan}. The Lagrangian is singular together with "
             "its constraints: remove the coordinates that it does not determine, or choose another discrete Lagrangian."
         )
-    known = None if isinstance(plan, str) or plan.solvers[0].equations.slower else plan.solvers[0]
+    known = None if isinstance(plan, str) else plan.solvers[0]
     if known is None and equation.stages[0][0].unknowns ** 2 > LARGEST_MATRIX:
         return start
     written = None if isinstance(plan, str) else plan.equation.stages[0][0]

@@ -20,8 +20,9 @@ def by_sites(stage: Any, shapes: tuple) -> tuple[Any, SparseSolver] | str:
     are not the same expressions at many places. Raises `StructurallySingular`."""
     count = len(jax.tree.leaves(shapes))
     try:
-        residual, advance = sites_of(stage.residual, *shapes), sites_of(stage.advance, *shapes)
+        residual = sites_of(stage.residual, *shapes)
         entries, rows, columns = entries_of_jacobian(residual)
+        advance = sites_of(stage.advance, *shapes)
         of_residual = loops(residual, count, residual.results, residual.sizes)
         of_advance = loops(advance, count, advance.results, advance.sizes)
         values = loops(residual, count, [entries], [len(rows)])

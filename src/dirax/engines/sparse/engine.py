@@ -9,7 +9,7 @@ import jax
 from dirax.engines.contract import Problem
 from dirax.engines.sizes import sizes_of_traced
 from dirax.engines.sizes_of_many import sizes_of_many
-from dirax.engines.sparse.plan import sparse_plan
+from dirax.engines.sparse.plan import quicker_plan, sparse_plan
 from dirax.engines.xla.engine import Xla
 from dirax.engines.xla.lane import Numerics
 from dirax.program.interpreter import UnsupportedPrimitive
@@ -30,10 +30,9 @@ class Sparse(Xla):
         """A CPU, and sparse equations."""
         if (platform := jax.default_backend()) != "cpu":
             return f"JAX computes on {platform}"
-        plan = sparse_plan(problem.equation, problem.params, problem.batch_params)
-        if isinstance(plan, str) or not self.only_quicker:
-            return plan if isinstance(plan, str) else None
-        return next(filter(None, (solver.equations.slower for solver in plan.solvers)), None)
+        found = quicker_plan if self.only_quicker else sparse_plan
+        plan = found(problem.equation, problem.params, problem.batch_params)
+        return plan if isinstance(plan, str) else None
 
     def _planned(self, p: Problem) -> tuple[Problem, Numerics, dict[str, Any]]:
         plan = sparse_plan(p.equation, p.params, p.batch_params)

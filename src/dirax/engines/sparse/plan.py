@@ -8,10 +8,11 @@ import numpy as np
 from jax.core import Tracer
 
 from dirax.engines import policy
+from dirax.engines.contract import size_of
 from dirax.engines.in_jax import joined, replaced
 from dirax.engines.sparse.by_sites import by_sites
 from dirax.engines.sparse.solver import SparseSolver
-from dirax.engines.step_program import step_program
+from dirax.engines.step_program import FULL, step_program
 from dirax.numerics.sparse.elimination import StructurallySingular
 from dirax.program.counts import array_operations
 from dirax.program.graph import GraphTooLarge
@@ -52,6 +53,28 @@ def sparse_plan(equation: Any, params: Any, batch_params: bool) -> SparsePlan | 
     whole = [leaf for leaf in leaves if not _is_float(leaf) and not isinstance(leaf, Tracer)]
     key = Same(equation), structure, batch_params, *map(np.shape, leaves), *(np.asarray(leaf).tobytes() for leaf in whole)
     return _plans.get(key, lambda: _planned(equation, params, batch_params))
+
+
+def quicker_plan(equation: Any, params: Any, batch_params: bool) -> SparsePlan | str:
+    """The same where sparse elimination is quicker than that of dense matrices; why it is not, where it is not."""
+    if full := _full(equation, params, batch_params):
+        return full
+    plan = sparse_plan(equation, params, batch_params)
+    return plan if isinstance(plan, str) else next(filter(None, (solver.equations.slower for solver in plan.solvers)), plan)
+
+
+def _full(equation: Any, params: Any, batch_params: bool) -> str | None:
+    """Why a step of moderate size is not sparse, which its scalar program says at once; None where it does not."""
+    if size_of(equation) > policy.LARGEST_SCALARS:
+        return None
+    try:
+        full = step_program(equation, params, batch_params).full
+    except UnsupportedPrimitive:
+        return None
+    unknowns = max(stage.unknowns for stage, _ in equation.stages)
+    if 2 * full <= unknowns:
+        return None
+    return f"{full} equations of {unknowns} need each other's unknowns, in more than one entry of {FULL} of their matrix"
 
 
 def _is_float(leaf: Any) -> bool:

@@ -15,6 +15,10 @@ from dirax.program.sites.courses import ALL, Course, Listed, NotBySites, entries
 SHORT = 64
 """Terms of a sum that are written out; longer sums of everything are loops of their own."""
 
+LONGEST = 10_000
+"""Nodes of all expressions of a function: a mesh of springs in space has 1 500, those of a few dozen bodies that all attract each
+other, which have no sites, would take a second to be found for every 10 000."""
+
 
 class Place(NamedTuple):
     """Where an input of an expression is: in an argument, by entries of a piece."""
@@ -44,7 +48,7 @@ class Expressions:
     """A graph whose inputs are places of arguments."""
 
     def __init__(self) -> None:
-        self.graph = Graph()
+        self.graph = Graph(LONGEST)
         self.places: dict[int, Place] = {}
         self._lists: dict[Listed, int] = {}
         self._moved: dict[tuple[int, Course, int], int] = {}

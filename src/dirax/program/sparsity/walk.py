@@ -134,7 +134,8 @@ def _results(equation: Any, operands: list[Value]) -> list[Value]:
         return movement.scattered(equation, *operands)
     if name == "cond":
         return _branches(equation, operands)
-    if not any(o.sets is not None for o in operands):
+    moving = any(np.issubdtype(v.aval.dtype, np.inexact) for v in equation.outvars)
+    if not moving or all(o.sets is None for o in operands):
         return [Value()] * len(equation.outvars)
     return (arithmetic.by_matrix if name in BY_MATRIX else arithmetic.all_of_all)(equation, *operands)
 
