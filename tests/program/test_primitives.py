@@ -164,6 +164,14 @@ CASES = {
         V,
         V,
     ),
+    "complex branches": (
+        lambda x, y: jax.grad(
+            lambda x: parts(jax.lax.cond(x[0] > 0, lambda z: z**2 + jax.nn.sigmoid(z), lambda z: ROOT * z, z_of(x, y))).sum()
+        )(x)
+        + parts(jax.lax.rsqrt(z_of(x, y)))[1],
+        V,
+        V,
+    ),
     "complex signs": (lambda x, y: parts(jnp.sign(z_of(x, y)) + jnp.sign(z_of(0 * x, 0 * x))), V, V),
     "complex zero": (
         lambda x, y: (

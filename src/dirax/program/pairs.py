@@ -81,6 +81,12 @@ def expm1(x: Pair) -> Pair:
     return Pair(jnp.expm1(x.re) * jnp.cos(x.im) - 2 * s * s, jnp.exp(x.re) * jnp.sin(x.im))
 
 
+def logistic(x: Pair) -> Pair:
+    """1/(1 + e to the −x)."""
+    e = exp(negative(x))
+    return power(Pair(1 + e.re, e.im), -1)
+
+
 def log(x: Pair) -> Pair:
     """The logarithm, with an imaginary part between −π and π."""
     return Pair(jnp.log(x.re * x.re + x.im * x.im) / 2, jnp.arctan2(x.im, x.re))
