@@ -165,10 +165,12 @@ CASES = {
         V,
     ),
     "complex branches": (
-        lambda x, y: jax.grad(
-            lambda x: parts(jax.lax.cond(x[0] > 0, lambda z: z**2 + jax.nn.sigmoid(z), lambda z: ROOT * z, z_of(x, y))).sum()
-        )(x)
-        + parts(jax.lax.rsqrt(z_of(x, y)))[1],
+        lambda x, y: (
+            jax.grad(
+                lambda x: parts(jax.lax.cond(x[0] > 0, lambda z: z**2 + jax.nn.sigmoid(z), lambda z: ROOT * z, z_of(x, y))).sum()
+            )(x)
+            + parts(jax.lax.rsqrt(z_of(x, y)))[1]
+        ),
         V,
         V,
     ),

@@ -27,13 +27,14 @@ def force_function(forces: Callable, constrained: bool) -> UserFunction:
     """The forces of a user, with or without `multipliers` among their arguments. Raises `ValueError` for forces of constraints
     that there are not."""
     try:
-        names = list(inspect.signature(forces).parameters)
+        parameters = inspect.signature(forces).parameters
     except (TypeError, ValueError):
-        names = []
-    if "multipliers" in names and names[3:4] != ["multipliers"]:
+        parameters = {}
+    names, given = list(parameters), [p for p in parameters.values() if p.default is p.empty]
+    if ("multipliers" in names or len(given) == 5) and names[3:4] != ["multipliers"]:
         raise TypeError(
-            f"forces that see the multipliers are forces(t, q, v, multipliers[, params]), but a function of "
-            f"({', '.join(names)}) was given."
+            "forces that see the multipliers are forces(t, q, v, multipliers[, params]), with an argument of that name in that "
+            f"place, and others forces(t, q, v[, params]), but a function of ({', '.join(names)}) was given."
         )
     if names[3:4] != ["multipliers"]:
         return UserFunction(forces, "forces", ("t", "q", "v"))
