@@ -94,7 +94,8 @@ RULES.update({
     for name, function in {
         "add": pairs.add, "add_any": pairs.add, "sub": pairs.subtract, "neg": pairs.negative, "mul": pairs.multiply,
         "div": pairs.divide, "abs": pairs.size, "sign": pairs.sign, "exp": pairs.exp, "expm1": pairs.expm1, "log": pairs.log,
-        "log1p": pairs.log1p, "sqrt": pairs.sqrt, "rsqrt": lambda x: pairs.power(pairs.sqrt(x), -1), "logistic": pairs.logistic, "sin": pairs.sin, "cos": pairs.cos, "tan": pairs.tan, "sinh": pairs.sinh,
+        "log1p": pairs.log1p, "sqrt": pairs.sqrt, "sin": pairs.sin, "cos": pairs.cos, "tan": pairs.tan, "sinh": pairs.sinh,
+        "rsqrt": lambda x: pairs.power(pairs.sqrt(x), -1), "logistic": pairs.logistic,
         "cosh": pairs.cosh, "tanh": pairs.tanh, "real": lambda x: x.re, "imag": lambda x: x.im,
         "conj": lambda x: Pair(x.re, -x.im), "square": lambda x: pairs.multiply(x, x), "pow": pairs.power_of,
         "eq": lambda x, y: (x.re == y.re) & (x.im == y.im), "ne": lambda x, y: (x.re != y.re) | (x.im != y.im),
