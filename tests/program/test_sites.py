@@ -30,6 +30,15 @@ def lattice(q, rows=7):
     return jnp.sum(along**4) + jnp.sum(jnp.cos(across)) + jnp.sum(u[1:, 1:] * u[:-1, :-1])
 
 
+def waves(p):
+    """Of a complex lattice, some of whose couplings are complex numbers, written in several ways."""
+    z = jax.lax.complex(p[:N], p[N:])
+    coupled = jnp.exp(1j * MASSES) * jnp.conj(z) * jnp.roll(z, 1)
+    return (
+        jnp.sum(jnp.abs(z[1:] - z[:-1]) ** 2) + jnp.sum(jnp.abs(z) ** 4) + jnp.real(jnp.sum(jnp.where(p[:N] > 0, coupled, z**2)))
+    )
+
+
 @jax.custom_jvp
 def steep(x):
     return jnp.sin(x)
@@ -54,13 +63,14 @@ FUNCTIONS = {
     "few": (lambda q: jnp.sum(jnp.sin(q[:8, None] - q[None, :8]), axis=1), Q),
     "sums beside a chain": (lambda p: jnp.append(jax.grad(energy)(p[:-1]) + p[-1], p[-1] * energy(p[:-1]) + p @ jnp.sin(p)), P),
     "sums over edges": (lambda q: jnp.append(jnp.sin(q), jnp.sum(q[DRAWN] * q[DRAWN[::-1]]) * jnp.sum(q**3)), P),
+    "complex": (jax.grad(waves), P[: 2 * N]),
     "rules": (lambda q: steep(q) * jax.lax.stop_gradient(q) + jax.nn.softplus(q), np.linspace(-2.0, 2.2, 50)),
 }
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
 @pytest.mark.soak_of(
-    but=["links", "turned", "masked", "total", "lattice by columns", "beside nothing", "totals of rows", "rules"]
+    but=["links", "turned", "masked", "total", "lattice by columns", "beside nothing", "totals of rows", "rules", "complex"]
 )
 def test_loops_over_sites_do_what_jax_does(name):
     function, given = FUNCTIONS[name]
@@ -71,9 +81,9 @@ def test_loops_over_sites_do_what_jax_does(name):
 
 
 @pytest.mark.parametrize(
-    "name", ["chain", "masses", "edges", "rules", "one in two", "lattice", "sums beside a chain", "sums over edges"]
+    "name", ["chain", "masses", "edges", "rules", "one in two", "lattice", "sums beside a chain", "sums over edges", "complex"]
 )
-@pytest.mark.soak_of(but=["edges"])
+@pytest.mark.soak_of(but=["edges", "complex"])
 def test_entries_of_the_jacobian_are_all_of_it(name):
     function, given = FUNCTIONS[name]
     sites = sites_of(function, jax.ShapeDtypeStruct(given.shape, float))

@@ -26,10 +26,27 @@ def is_complex(atom: Any) -> bool:
     return getattr(atom.aval, "dtype", None) == np.complex128
 
 
+def has_complex(equation: Any) -> bool:
+    """Whether an equation of a jaxpr has complex operands or results."""
+    return any(map(is_complex, (*equation.invars, *equation.outvars)))
+
+
 def in_pairs(equation: Any) -> ClosedJaxpr | None:
     """The jaxpr from the operands of an equation to its results, both flattened, without complex numbers; None where a primitive
     has no rule."""
     return _written.get(Same(equation), lambda: _traced(equation))
+
+
+def by_pairs(equation: Any, operands: Sequence[Any], run: Callable[[ClosedJaxpr, list[Any]], Sequence[Any]]) -> list[Any] | None:
+    """The results of an equation with complex operands or results, each a `Pair`, by a `run` of its jaxpr of real ones; what is
+    no pair stands for both of its parts. None where a primitive has no rule."""
+    if (closed := in_pairs(equation)) is None:
+        return None
+    given = []
+    for operand, variable in zip(operands, equation.invars, strict=True):
+        given.extend(operand if isinstance(operand, Pair) else [operand] * (1 + is_complex(variable)))
+    found = iter(run(closed, given))
+    return [Pair(next(found), next(found)) if is_complex(v) else next(found) for v in equation.outvars]
 
 
 class NotInPairs(Exception):
@@ -60,7 +77,7 @@ def _run(closed: ClosedJaxpr, *operands: Any) -> list[Any]:
     read = lambda atom: _paired(atom.val) if isinstance(atom, Literal) else values[atom]
     for equation in jaxpr.eqns:
         given = [read(atom) for atom in equation.invars]
-        if not any(map(is_complex, (*equation.invars, *equation.outvars))):
+        if not has_complex(equation):
             variables = [v for v in equation.invars if not isinstance(v, Literal)]
             alone = jaxpr.replace(constvars=(), invars=variables, outvars=equation.outvars, eqns=[equation])
             known = [x for x, v in zip(given, equation.invars, strict=True) if not isinstance(v, Literal)]

@@ -9,7 +9,7 @@ from jax._src import source_info_util
 from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Literal
 
-from dirax.program.complex_numbers import in_pairs, is_complex
+from dirax.program.complex_numbers import by_pairs, has_complex
 from dirax.program.graph import Graph
 from dirax.program.pairs import Pair
 from dirax.program.whole_numbers import Ranges, are_floats
@@ -196,7 +196,7 @@ class Interpreter:
         try:
             if lost is not None and name not in LAZY:
                 return self._known(equation, operands) or [Unavailable(lost.error)] * len(equation.outvars)
-            if any(map(is_complex, (*equation.invars, *equation.outvars))) and name not in IN_PAIRS:
+            if has_complex(equation) and name not in IN_PAIRS:
                 return self._in_pairs(equation, operands)
             if name not in self.rules:
                 raise Unsupported("is not supported")
@@ -213,14 +213,10 @@ class Interpreter:
 
     def _in_pairs(self, equation: Any, operands: list[Any]) -> list[Any]:
         """The results of an equation with complex numbers, by the real parts that it is made of. Raises `Unsupported`."""
-        if (closed := in_pairs(equation)) is None:
+        found = by_pairs(equation, operands, lambda closed, parts: self.run(closed, *parts))  # one that is lost is so twice
+        if found is None:
             raise Unsupported("is not known of complex numbers")
-        given = []
-        for operand, variable in zip(operands, equation.invars, strict=True):
-            parts = operand if isinstance(operand, Pair) else [operand] * (1 + is_complex(variable))  # one that is lost twice
-            given.extend(parts)
-        found = iter(self.run(closed, *given))
-        return [Pair(next(found), next(found)) if is_complex(v) else next(found) for v in equation.outvars]
+        return found
 
 
 def folds(equation: Any) -> bool:

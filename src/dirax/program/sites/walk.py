@@ -10,7 +10,9 @@ from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Literal
 from jax.interpreters import partial_eval
 
+from dirax.program.complex_numbers import by_pairs, has_complex
 from dirax.program.interpreter import RULES, Interpreter, Unsupported, check_dtypes, is_integer
+from dirax.program.pairs import Pair
 from dirax.program.rules.control import inner_jaxpr
 from dirax.program.rules.differentiable import RULED, is_float, tangent
 from dirax.program.rules.reductions import FOLDS, factors_of_product
@@ -76,15 +78,16 @@ class _Walk:
     def _argument(self, number: int, size: int) -> list[Piece]:
         return [Piece(Course(0, 1), size, self.expressions.input(Place(number, Course(0, int(size > 1)))))] if size else []
 
-    def _run(self, closed: ClosedJaxpr, operands: Sequence[Value]) -> list[Value]:
+    def _run(self, closed: ClosedJaxpr, operands: Sequence[Any]) -> list[Any]:
+        """The results of a jaxpr: each a Value, or a pair of them where it is complex."""
         jaxpr, used = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars))[:2]
-        values: dict[Any, Value] = {}
+        values: dict[Any, Any] = {}
         for variable, constant in zip(closed.jaxpr.constvars, closed.consts, strict=True):
             if isinstance(constant, Tracer):
                 raise NotBySites("an array that JAX traces is captured")
-            values[variable] = np.asarray(constant)
+            values[variable] = _in_parts(constant)
         values.update(zip(jaxpr.invars, (o for o, u in zip(operands, used, strict=True) if u), strict=True))
-        read = lambda atom: np.asarray(atom.val) if isinstance(atom, Literal) else values[atom]
+        read = lambda atom: _in_parts(atom.val) if isinstance(atom, Literal) else values[atom]
         for equation in jaxpr.eqns:  # before anything is done
             if equation.primitive.name in NEVER:
                 raise NotBySites(f"'{equation.primitive.name}' is not known entry by entry")
@@ -93,7 +96,7 @@ class _Walk:
             values.update((v, self._whole(x, v)) for v, x in zip(equation.outvars, results, strict=True))
         return [read(atom) for atom in jaxpr.outvars]
 
-    def _whole(self, value: Value, variable: Any) -> Value:
+    def _whole(self, value: Any, variable: Any) -> Any:
         """Whole numbers as their type has them."""
         if isinstance(value, np.ndarray) or not is_integer(variable):
             return value
@@ -103,9 +106,10 @@ class _Walk:
             raise NotBySites(str(error)) from None
         return [piece._replace(node=node) for piece, node in zip(value, nodes.tolist(), strict=True)]
 
-    def _equation(self, equation: Any, operands: list[Value]) -> Sequence[Value]:
+    def _equation(self, equation: Any, operands: list[Any]) -> Sequence[Any]:
         name, p = equation.primitive.name, equation.params
-        if name in RULED and not self.plain and not all(isinstance(o, np.ndarray) for o in operands):
+        known = all(isinstance(part, np.ndarray) for o in operands for part in (o if isinstance(o, Pair) else (o,)))
+        if name in RULED and not self.plain and not known:
             try:
                 return self._by_its_rule(equation, operands)
             except Unsupported as error:
@@ -116,7 +120,11 @@ class _Walk:
         if name.startswith("dirax_"):
             impl = lambda *given: equation.primitive.impl(*given, **p)
             return self._run(jax.make_jaxpr(impl)(*(v.aval for v in equation.invars)), operands)
-        if all(isinstance(o, np.ndarray) for o in operands):
+        if has_complex(equation):
+            if (found := by_pairs(equation, operands, self._run)) is None:
+                raise NotBySites(f"'{name}' is not known of complex numbers")
+            return found
+        if known:
             return self._known(equation, operands)
         if not any(v.aval.size for v in equation.outvars):
             return [[] for _ in equation.outvars]
@@ -147,6 +155,8 @@ class _Walk:
             pieces = [self.pieces(x, v.aval.shape) for x, v in chosen]
             return [[p._replace(node=make(op, p.node)) for p in own] for own in pieces]
 
+        if has_complex(equation):
+            raise Unsupported("has complex numbers")
         if equation.primitive.name == "stop_gradient":
             return of("held", equation.invars)
         inner = inner_jaxpr(equation)
@@ -311,6 +321,12 @@ class _Walk:
             self.totals.append(pieces)
             found.append(Piece(Course(i, 1), 1, self.expressions.input(Place(-1, Course(len(self.totals) - 1, 0)))))
         return found
+
+
+def _in_parts(constant: Any) -> np.ndarray | Pair:
+    """An array whose numbers are known, a pair of such where they are complex."""
+    array = np.asarray(constant)
+    return Pair(array.real, array.imag) if array.dtype == np.complex128 else array
 
 
 def _periods(shape: tuple[int, ...]) -> list[int]:
