@@ -100,3 +100,19 @@ def test_a_large_step_that_takes_xla_longer_is_traced_further(monkeypatch):
     pairs = potential(lambda q: q[:, None] - q[None, :])
     of_arrays = dx.simulate(pairs, dx.LagrangeDAlembert(), **RUN)
     assert of_arrays.stats["engine"] == "xla" and "scalar operations" in of_arrays.stats["not_native"]
+
+
+def test_a_first_step_too_stiff_for_what_native_has_is_taken_by_xla(monkeypatch):
+    """A fixed point of the rates at two nodes diverges, and Newton's methods are made too large to be written."""
+
+    def refuse(*given):
+        raise UnsupportedPrimitive("the step as a whole", "is too large", "here")
+
+    stiff = dx.LagrangeDirac(lambda q, v: v @ v / 2 - 1e6 * q @ q / 2 - jnp.sum(jnp.cos(q)))
+    run = {"q": [1.5, -0.4], "v": [0.0, 1.0], "step": 0.2, "steps": 4}
+    monkeypatch.setattr("dirax.engines.native.run.kernels", refuse)
+    monkeypatch.setattr("dirax.engines.native.collocation_kernels.CollocationKernels.by_newton", None)
+    native = dx.simulate(stiff, dx.Collocation(2), **run, engine="native")
+    assert not native.ok and "Newton's method is too large for this engine" in native.message
+    sol = dx.simulate(stiff, dx.Collocation(2), **run)
+    assert sol.ok and sol.stats["engine"] == "xla" and "too large for this engine" in sol.stats["not_native"]

@@ -3,8 +3,10 @@
 from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
 
+import numpy as np
+
 from dirax.engines import policy
-from dirax.engines.contract import Outcome, Problem, Progress
+from dirax.engines.contract import TOO_LARGE, Outcome, Problem, Progress
 from dirax.engines.engine import AbstractEngine
 from dirax.engines.walk import AbstractWalk, WalkByRuns
 from dirax.engines.xla import Xla
@@ -32,7 +34,12 @@ class Auto(AbstractEngine):
 
     def prepared(self, problem: Problem) -> Callable[[Problem, Progress | None], Outcome]:
         """`run` of the engine that takes the problem."""
-        return _first(problem, lambda engine, notes: _with_notes(engine.prepared(problem), notes))
+
+        def made(engine: AbstractEngine, notes: Notes) -> Callable[[Problem, Progress | None], Outcome]:
+            run = _with_notes(engine.prepared(problem), notes)
+            return run if notes or problem.equation.stages[0][0].collocation is None else _by_another_where_stiff(run)
+
+        return _first(problem, made)
 
     def walks(self, problem: Problem) -> Callable[[Problem], AbstractWalk]:
         """By the native engine, or by runs of that which takes the problem."""
@@ -46,6 +53,22 @@ class Auto(AbstractEngine):
     def run_traced(self, problem: Problem) -> Outcome:
         """The same."""
         return _first(problem, lambda engine, notes: _with_notes(engine.run_traced, notes)(problem), traced=True)
+
+
+def _by_another_where_stiff(run: Callable[..., Outcome]) -> Callable[..., Outcome]:
+    """A run by the native engine, or by the next one where its first step is too stiff for a fixed point and too large for
+    another iteration."""
+
+    def either(problem: Problem, progress: Progress | None = None) -> Outcome:
+        outcome = run(problem, progress)
+        tried = outcome.notes.get("iteration", "")
+        if TOO_LARGE not in tried or outcome.interrupted or np.any(outcome.completed):
+            return outcome
+        notes: Notes = {}
+        engine = next(engine for engine in in_turn(problem, notes) if engine.name != "native")
+        return _with_notes(engine.run, notes | {"not_native": tried})(problem, progress)
+
+    return either
 
 
 def _with_notes(run: Callable[..., Outcome], notes: Notes) -> Callable[..., Outcome]:
