@@ -406,6 +406,16 @@ def test_a_failed_run_is_checked_as_far_as_it_got():
     assert report["symplecticity of one step"].verdict == "ok"
 
 
+@pytest.mark.parametrize("lanes", [(), (2,)])
+def test_a_run_whose_first_step_failed_has_no_constraint_to_be_checked(lanes):
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2 + jnp.log(1 - q @ q), lambda q: jnp.array([[0.0, 1.0, 0.0]]))
+    q, v = np.broadcast_to([0.5, 0.0, 0.0], (*lanes, 3)), np.broadcast_to([5.0, 0.0, 1.0], (*lanes, 3))
+    sol = dx.simulate(system, dx.MinusLagrangeDirac(), q=q, v=v, step=0.5, steps=3)
+    report = dx.verify(sol)
+    assert not np.any(sol.ok) and not report.ok
+    assert next(line for line in report.lines if line.quantity == "constraint").verdict == "not checked"
+
+
 def test_rows_that_are_not_saved_cannot_be_checked():
     sol = dx.simulate(DISK, dx.PlusLagrangeDirac(), step=0.01, steps=20, save_every=4, q=np.zeros(4), v=[1.0, 0.0, 1.0, 0.5])
     report = verify(sol)

@@ -82,7 +82,7 @@ def stationary_action(solution: Solution, structure: Any, tolerance: float | Non
     inner, axis = sampled_rows(solution, solution.rows - 2), int(solution.batch is not None)
     items = consecutive(solution, ("q",), 3, inner)
     moved = np.abs(np.diff(items["q"], axis=axis + 1))
-    moved = np.nanmax(moved, axis=tuple(range(moved.ndim - 1)))  # the units of each coordinate
+    moved = np.nanmax(moved, axis=tuple(range(moved.ndim - 1)), initial=0.0)  # the units of each coordinate
     along = np.where(moved > 0.0, moved, 1.0) * np.random.default_rng(0).normal(size=np.take(items["q"], 1, axis=axis + 1).shape)
     varied, items = eqx.Partial(_varied, structure), (items, along)
     terms, limit = over_rows(varied, solution, items), roundoff_limit(tolerance, 1)

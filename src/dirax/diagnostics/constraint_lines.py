@@ -1,5 +1,6 @@
 """Lines of `dx.verify` on constraints and hidden constraints."""
 
+import math
 from typing import Any
 
 import equinox as eqx
@@ -26,7 +27,10 @@ def constraint(sol: Solution, structure: AbstractDiscreteStructure | str, tolera
         return Line(name, None, None, NOT_CHECKED, str(error))
     if residual.shape[-1] == 0:
         return None
-    residual = np.abs(residual.reshape((-1, *residual.shape[-2:])))
+    residual = np.abs(residual.reshape((math.prod(residual.shape[:-2]), *residual.shape[-2:])))
+    given = int("constraint" in sol.fields and "q0" in sol.initial)  # the first pair was given, not computed
+    if np.all(np.isnan(residual[:, given:])):
+        return Line(name, None, None, NOT_CHECKED, "no step was computed")
     residual = np.where(np.isnan(residual), 0.0, residual)  # rows that were not reached
     scale, redundant = _constraint_scale(sol, structure, residual.shape[-1]), list(sol.stats.get("redundant_constraints", ()))
     scale = np.broadcast_to(scale, residual.shape[-1:]).copy()
@@ -37,9 +41,6 @@ def constraint(sol: Solution, structure: AbstractDiscreteStructure | str, tolera
     if not steps and sol.system is not None and "p" in sol.fields and np.any(residual > roundoff_limit(tolerance, 1) * scale):
         scale = scale + _moved_by_momenta(sol, at_rows(sol, constraint_at))
     values, residual = np.max(residual / scale, axis=-1), np.max(residual, axis=-1)
-    given = int(steps and "q0" in sol.initial)  # the first pair was given, not computed
-    if residual.shape[1] <= given:
-        return Line(name, None, None, NOT_CHECKED, "no step was computed")
     values = values[:, given:]
     lane, row = worst_place(values)
     kind = "discrete constraint of each step" if steps else "constraint at each row"
