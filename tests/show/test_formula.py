@@ -69,3 +69,9 @@ def test_the_disk_of_the_gallery():
         "x\u0307 − R θ\u0307 cos φ = 0",
         "y\u0307 − R θ\u0307 sin φ = 0",
     ]
+
+
+def test_a_hamiltonian_of_a_momentum_and_what_is_advected():
+    sol = gallery.get("heavy-top-so3").simulate(steps=2)
+    (line,) = (f"{joined(e.left).text} = {joined(e.right).text}" for e in statement.equations(sol))
+    assert line == "H = (Π1²/I1 + Π2²/I2 + Π3²/I3)/2 + mgl Γ3"

@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from dirax.geometry.semidirect import SemidirectProduct
 from dirax.program.user_functions import UserFunction
 from dirax.show.formula import formulas
 from dirax.show.letters import Written, joined, of_params, symbol, symbols
@@ -138,10 +139,10 @@ class _Formulas:
                     self.known[name] = (row, symbols(names))
                     if name == "q":
                         self.known["v"] = (row, symbols(names, dotted=True))
-        if "x" in self.known:  # of Lie–Poisson systems: momentum, and what is advected
-            row, names = self.known["x"]
-            split = len(row) - int(getattr(sol.system, "advected", 0) or 0)
-            self.known["mu"], self.known["a"] = (row[:split], names[:split]), (row[split:], names[split:])
+        space = getattr(sol.system, "space", None)
+        if "x" in self.known and isinstance(space, SemidirectProduct):
+            moved, advected = zip(*map(space.split, self.known["x"]), strict=True)
+            self.known |= {"mu": moved, "a": advected}
 
     def of(self, function: Callable | None, arguments: Sequence[str]) -> list[list[Written]] | None:
         if function is None or any(name not in self.known for name in arguments):
