@@ -44,8 +44,8 @@ and .7); a mesh of 25 points, 29 335, 2.3 and .02 (sparse: 4.7 and .1); first gr
 
 LARGEST_SCALARS, MOST_NOT_SPARSE = 384, 60_000
 """Both for a step that the sparse engine leaves. First call, and 1000 steps, natively and by XLA: twenty bobs on rods by Method
-2, 300 unknowns and 29 297 operations, 5 s and .34 s (5.3 and 4.2), fifteen by Lobatto's nodes, 40 973, 3.3 and .06 (4.8 and 30);
-14 bodies that attract each other, 50 451, 2.5 and .06 (2.2 and .46); first gradients in half the time."""
+2, 300 unknowns and 29 297 operations, 6.2 s and .32 s (5.3 and 4.2), fifteen by Lobatto's nodes, 40 973, 3.3 and .06 (4.8 and
+30); 14 bodies that attract each other, 50 451, 2.5 and .06 (2.2 and .46); first gradients in half the time."""
 
 # ---------------------------------------------------------------------------------------------- what "auto" gives to sparse
 

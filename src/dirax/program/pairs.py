@@ -95,9 +95,10 @@ def log(x: Pair) -> Pair:
 def log1p(x: Pair) -> Pair:
     """The logarithm of 1 + x, where 1 + x is small from itself."""
     re = 1 + x.re
-    small = re * re + x.im * x.im < 0.25
+    square = re * re + x.im * x.im
+    small = square < 0.25
     more = jnp.where(small, 0.0, x.re * (2 + x.re) + x.im * x.im)
-    of_size = jnp.where(small, jnp.log(jnp.where(small, re * re + x.im * x.im, 1.0)), jnp.log1p(more))
+    of_size = jnp.where(small, jnp.log(jnp.where(small, square, 1.0)), jnp.log1p(more))
     return Pair(of_size / 2, jnp.arctan2(x.im, re))
 
 

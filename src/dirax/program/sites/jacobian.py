@@ -4,20 +4,20 @@ import numpy as np
 
 from dirax.program.graph_derivatives import jacobian
 from dirax.program.sites.courses import ALL, Course, NotBySites
-from dirax.program.sites.pieces import Expressions, Piece, Place, combined, gathered, one_at_a_time
+from dirax.program.sites.pieces import LONGEST, Expressions, Piece, Place, combined, gathered, one_at_a_time
 from dirax.program.sites.walk import Sites
 
 MOST_ENTRIES = 512
 """Different expressions among the entries: more take LLVM longer than XLA."""
 
 DERIVED = 10
-"""How many times as many nodes as an array its Jacobian may have."""
+"""How many times as many nodes as a function its Jacobian may have."""
 
 
 def entries_of_jacobian(sites: Sites, argument: int = 0) -> tuple[list[Piece], np.ndarray, np.ndarray]:
     """The entries that can differ from zero as one array in pieces, and their rows and columns. Raises `NotBySites`."""
     (result,), found, rows, columns, first = sites.results, [], [], [], 0
-    sites.expressions.graph.limit *= DERIVED
+    sites.expressions.graph.limit = DERIVED * LONGEST
     for piece in result:
         terms = _terms(sites, piece, argument)
         if len(found) + len(terms) > MOST_ENTRIES:
