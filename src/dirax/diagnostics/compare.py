@@ -213,7 +213,7 @@ def _entry(name: str, sol: Solution, order, precision, note: str, seconds: float
         if not np.all(np.isfinite(energy)):
             drift = "not finite"
         elif not changes:
-            drift = judge(sol.t, energy, motion, roundoff, size, partial(energy_parts, sol)).verdict
+            drift = judge(sol.t, energy, motion, roundoff, size, partial(energy_parts, sol, sol.rows)).verdict
     constraint = np.asarray(sol.constraint_residual())
     return Entry(
         scheme=name,

@@ -70,7 +70,7 @@ def energy_line(sol: Solution) -> Line:
     times, found = sol.times, []
     for lane, series in enumerate(energy):
         good = np.isfinite(series)
-        parts = partial(energy_parts, sol, lane)
+        parts = partial(energy_parts, sol, int(np.sum(good)), lane)
         found.append(judge(times[lane][good], series[good], _motion(sol, lane)[good], roundoff, size, parts))
     order = (NOT_CHECKED, BOUNDED, DRIFTS)
     lane = max(range(len(found)), key=lambda i: (order.index(found[i].verdict), abs(found[i].drift)))
@@ -187,10 +187,9 @@ def _motion(sol: Solution, lane: int) -> np.ndarray:
     return np.concatenate([np.asarray(a).reshape(len(a), -1) for a in rows], axis=1)
 
 
-def energy_parts(sol: Solution, lane: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """What each number of a row has to do with the energy of a trajectory: times (n,), and (n, numbers) the energy less what it
-    were with this number as at the start. Nothing of a large system."""
-    count = int(np.sum(np.isfinite(energy_of(sol).reshape(-1, sol.rows)[lane])))
+def energy_parts(sol: Solution, count: int, lane: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """What each number of one of the first `count` rows has to do with the energy of a trajectory: times (n,), and (n, numbers)
+    the energy less what it were with this number as at the start. Nothing of a large system."""
     rows = np.unique(np.linspace(0, count - 1, min(count, PARTS_AT)).astype(int))
     times = sol.times[lane][rows]
     if sol.system is None or row_numbers(sol) > LARGE:

@@ -14,7 +14,7 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
 from dirax.program.evaluation.by_jax import by_jax
 from dirax.program.evaluation.in_floats import Floats, in_floats
-from dirax.program.evaluation.in_numpy import LANES, Values, in_parts
+from dirax.program.evaluation.in_numpy import LANES, Values, in_parts, lanes_of
 from dirax.program.evaluation.noise import Noise
 from dirax.program.evaluation.tape import FEWEST_NODES, Tape
 from dirax.program.graph import NODE_LIMIT, Graph, GraphTooLarge, Order, with_ends
@@ -125,7 +125,7 @@ class ScalarProgram:
         if len(leaves[0]) == 1 and noise is None and self._asked > OFTEN:
             with contextlib.suppress(ArithmeticError, ValueError):  # what Python's floats do not have
                 return self._by_floats(leaves)
-        return in_parts(functools.partial(self._part, noise=noise), leaves)
+        return in_parts(functools.partial(self._part, noise=noise), leaves, lanes_of(self.graph))
 
     def _by_floats(self, leaves: list[np.ndarray]) -> list[np.ndarray]:
         found, results, at = self.in_floats([x for leaf in leaves for x in np.asarray(leaf, float).ravel().tolist()]), [], 0

@@ -15,6 +15,9 @@ from dirax.program.interpreter import Nodes
 LANES = 1024
 """Entries of a batch that are computed at a time, which bounds the memory that the nodes' values take."""
 
+MORE_LANES, MOST_VALUES = 4 * LANES, 2**24
+"""Entries at a time of a graph with few nodes, where what an operation takes is Python's, and the values there may be then."""
+
 
 class Values:
     """What nodes of a graph are at some entries; operands are computed where something needs them."""
@@ -143,6 +146,11 @@ class Slopes:
         if len(self.order.nodes) < FEWEST_NODES or not compiles():
             return None
         return RowTape(self.graph, self.nodes, self.inputs, self.more, self.terms, self.needed, self.backward)
+
+
+def lanes_of(graph: Graph) -> int:
+    """How many entries of a graph are computed at a time."""
+    return min(MORE_LANES, max(LANES, MOST_VALUES // max(1, len(graph))))
 
 
 def in_parts(function: Callable, leaves: list[np.ndarray], most: int = LANES) -> list[np.ndarray]:

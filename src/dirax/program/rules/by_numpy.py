@@ -37,7 +37,7 @@ TOGETHER = 2**18
 LARGE_PRODUCT = 256
 """Multiplications of a product of arrays from which on it is no graph of them."""
 
-MOST_KEPT = 2**14
+MOST_KEPT = 2**16
 """Numbers of roots, or inverses, side by side, up to which they are kept: those of a part of the rows of a run."""
 
 MOSTLY = 16
