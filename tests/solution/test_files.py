@@ -1,5 +1,6 @@
 """Files: exact round trips, named dimensions and units, no code from a file, nothing lost, one clear sentence of error."""
 
+import copy
 import errno
 import json
 import os
@@ -195,6 +196,23 @@ def test_schemes_with_code_come_from_the_argument(tmp_path):
     assert dx.load(path).scheme is None
     assert dx.load(path).metadata["scheme"] == "PlusLagrangeDirac(discrete_lagrangian=midpoint(q0, q1, h))"
     assert dx.load(path, system=oscillator, scheme=scheme).equation is not None
+
+
+def test_a_loaded_run_is_not_gone_through_with_the_steps_of_another_system(tmp_path):
+    driven = dx.PortHamiltonian(lambda x: x @ x / 2, np.array([[0.0, 1.0], [-1.0, 0.0]]), np.array([[0.0], [1.0]]))
+    push = lambda t, x: 5 * jnp.sin(1.3 * t)[None]
+    sol = dx.simulate(driven, dx.DiscreteGradient(), x=[1.0, 0.0], inputs=push, step=0.1, steps=20)
+    path, t = sol.save(tmp_path / "run.nc"), 1.63
+    assert bits(dx.load(path, system=driven, inputs=push).at(t).x) == bits(sol.at(t).x)
+    loaded = dx.load(path, system=driven)
+    for taken in (loaded, loaded[3:], copy.deepcopy(dx.load(path, system=GENTLE))):
+        with pytest.raises(ValueError, match=r"that dx\.load was given leads from row .* the run has .*inputs=…"):
+            taken.at(t)
+    with pytest.raises(ValueError, match="inputs= drives the system of the run"):
+        dx.load(path, inputs=push)
+
+
+GENTLE = dx.PortHamiltonian(lambda x: x @ x / 3, np.array([[0.0, 1.0], [-1.0, 0.0]]), np.array([[0.0], [1.0]]))
 
 
 def test_a_scheme_from_before_a_setting_and_a_module_had_their_names_comes_back():

@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -32,12 +32,14 @@ SLACK, ROUNDINGS = 1e-6, 8
 NOT_OURS = "its description is not one that dirax wrote"
 
 
-def load(path: str | os.PathLike, system: Any = None, scheme: Any = None, params: Any = None) -> Any:
+def load(
+    path: str | os.PathLike, system: Any = None, scheme: Any = None, params: Any = None, inputs: Callable | None = None
+) -> Any:
     """The Solution in a file that `Solution.save` wrote, bit for bit; the `xarray.Dataset` of a store that `dx.sweep` fills; the
     rows that are whole of a run that `dx.simulate(…, to=path)` writes or wrote, which are read where they are indexed.
 
     Code is not stored: `system` (and `scheme`, if it is not one of dirax with plain settings) supply it where it is needed,
-    as for `dx.verify`; energies and constraint residuals are in the file. `params` replaces the stored parameters: of a class of
+    as for `dx.verify`, with the `inputs` of `dx.simulate`; energies and constraint residuals are in the file. `params` replaces the stored parameters: of a class of
     your own the file has the numbers, as a dict by the names of its fields, and with `system` they have to be given.
     Loading never executes anything from the file, and takes no more memory than its numbers need.
 
@@ -59,6 +61,11 @@ def load(path: str | os.PathLike, system: Any = None, scheme: Any = None, params
         raise ValueError(
             f"the params of the run in {path} were made of {code}, which is code that no file holds: pass params=…{numbers}."
         )
+    if inputs is not None:
+        if system is None:
+            raise ValueError("inputs= drives the system of the run, which dx.load was not given: pass system=… too.")
+        system = system.with_inputs(inputs)
+    sol.supplied = system is not None
     return with_code(sol, system, scheme)
 
 

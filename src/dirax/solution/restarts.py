@@ -19,10 +19,11 @@ FEW = 100
 
 
 def refuse_restarting(again: Any) -> None:
-    """Raise `ValueError` where steps from the last row but one do not lead to the last one, by an equation that is a user's own;
-    `again` are the steps of a run once more, a `StepsAgain`."""
+    """Raise `ValueError` where steps from the last row but one do not lead to the last one, by an equation that is a user's own,
+    or of a system that was given to `dx.load`; `again` are the steps of a run once more, a `StepsAgain`."""
     sol, (first, _) = again.sol, again.equation.stages[0]
-    if not resumes_in_its_own_way(first) or sol.impacts is not None:
+    own = resumes_in_its_own_way(first)
+    if not (own or sol.supplied) or sol.impacts is not None:
         return
     nodes = {name: np.asarray(a) for name, a in sol.fields.items() if sol.field_info[name].place == "node"}
     nodes = nodes if sol.batch is not None else {name: a[None] for name, a in nodes.items()}
@@ -39,6 +40,11 @@ def refuse_restarting(again: Any) -> None:
         there, size = nodes[name][0, row + 1], np.nanmax(np.abs(nodes[name][0]), initial=0.0)
         if not np.all(np.abs(made[0] - there) <= RESUMED * size):
             came, expected = (np.array2string(a, precision=6) for a in (made[0], there))
+            if not own:
+                raise ValueError(
+                    f"a step of the system that dx.load was given leads from row {row} to {name} = {came}, where the run has "
+                    f"{expected}: give the system, scheme, params and inputs of the run, dx.load(path, system=…, inputs=…)."
+                )
             silent = first.resume is first.start
             says = f"{'does not say' if silent else 'says'} how the step that leaves a saved row begins"
             raise ValueError(

@@ -86,6 +86,9 @@ class Trajectory:
     """steps ↦ the first so many steps of a run that walls divide, once more from its beginning, with every row; None for other
     runs, and where it is not known how it was run."""
 
+    supplied: bool = False
+    """Whether its system was given to `dx.load`, so that it may be another one than that of the run."""
+
     lifted: Any = None
     """What this one was reconstructed from, a `Lifted`, where the steps of that make no rows of this one; None for others."""
 
@@ -128,7 +131,7 @@ class Trajectory:
 
     def __getstate__(self) -> dict[str, Any]:
         """What is pickled and copied in depth: no compiled code, so that nothing is known of how the run goes on."""
-        kept = {"axis", "_params", "events", "impacts", *GIVEN} - {"t", "equation"}
+        kept = {"axis", "_params", "events", "impacts", "supplied", *GIVEN} - {"t", "equation"}
         return {name: value for name, value in self.__dict__.items() if name in kept}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -141,7 +144,7 @@ class Trajectory:
         """A copy with other values for some of the constructor's arguments."""
         given = {name: getattr(self, name) for name in GIVEN} | {"t": self.axis, "params": self._params}
         copy = type(self)(**(given | changes))
-        copy.example, copy.events, copy.impacts = self.example, self.events, self.impacts
+        copy.example, copy.events, copy.impacts, copy.supplied = self.example, self.events, self.impacts, self.supplied
         return copy
 
     @property
