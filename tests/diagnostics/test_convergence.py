@@ -227,3 +227,14 @@ def test_equations_with_a_root_in_them_are_solved_explicitly_too():
     found = dx.convergence(body, dx.DiscreteDirac(), x=[0.5, 0.3, 0.4], time=1.0, step_sizes=[0.2, 0.1, 0.05])
     assert found.reference == "the explicit equations of motion"
     assert found.orders["x"] == pytest.approx(2.0, abs=0.05)
+
+
+def test_runs_that_an_event_ends_have_no_common_times():
+    thrown = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[1] - q[0] ** 4)
+    run = {"events": [dx.Event(lambda q: q[1], direction=-1, terminal=True)]}
+    for q, v in (([0.0, 1.0], [0.3, 1.0]), ([[0.0, 1.0], [0.0, 9.0]], [[0.3, 1.0], [0.3, 1.0]])):
+        with pytest.raises(ValueError, match=r"an event has ended the run with steps of 0.2 before t = 4, .* stop before them"):
+            dx.convergence(thrown, dx.LagrangeDAlembert(), q=q, v=v, step_sizes=[0.2, 0.1, 0.05], time=4.0, **run)
+    assert np.isfinite(
+        dx.convergence(thrown, dx.Collocation(1), q=q[0], v=v[0], step_sizes=[0.2, 0.1, 0.05], time=1.0, **run).order
+    )

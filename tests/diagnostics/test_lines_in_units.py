@@ -117,3 +117,16 @@ def test_what_is_left_of_a_zero_is_not_a_form_that_changed():
     q = np.linspace(-1, 1, 6) ** 3 + 0.3
     line = symplecticity(dx.simulate(system, dx.LagrangeDAlembert(), q=q, v=np.zeros(6), step=0.1, steps=5), None)
     assert line.verdict == "ok" and line.value is not None and line.value < 1e-15
+
+
+@pytest.mark.parametrize("scheme", [dx.LagrangeDAlembert(), dx.MinusLagrangeDirac()], ids=lambda scheme: type(scheme).__name__)
+def test_each_one_form_may_have_a_unit_of_its_own(scheme):
+    def last(unit):
+        system = dx.LagrangeDirac(
+            lambda q, v: v @ v / 2 - q[2], lambda q: jnp.array([[q[1], -q[0], 1.0, 0.3], [0.0, 0.0, unit, unit * q[0]]])
+        )
+        sol = dx.simulate(system, scheme, q=[0.6, 0.8, 0.2, 0.0], v=[0.4, -0.3, 0.5, 0.1], step=0.01, steps=30, project=True)
+        assert dx.verify(sol).ok
+        return sol.q[-1]
+
+    np.testing.assert_allclose([last(1e12), last(1e-13)], [last(1.0)] * 2, atol=1e-12)

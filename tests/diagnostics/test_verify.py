@@ -482,6 +482,15 @@ def test_an_energy_that_blows_up_is_called_so_however_few_rows_there_are(frequen
     assert ("the steps are too long" in line.explanation) == (frequency == 10.0)
 
 
+def test_a_step_that_turns_back_where_the_mass_is_zero_is_seen_in_few_rows():
+    """(2/3)q^(3/2) = 2/3 − t: the motion ends at q = 0. The nodes of a step have q < 0, and its ends have not."""
+    system = dx.LagrangeDirac(lambda q, v: q[0] * v[0] ** 2 / 2 + v[1] ** 2 / 2 - q[1] ** 2 / 2)
+    sol = dx.simulate(system, dx.Collocation(3), q=[1.0, 0.3], v=[-1.0, 0.0], step=0.013, steps=100)
+    assert sol.ok and np.all(sol.q[:, 0] > 0)
+    assert dx.verify(sol)["energy"].verdict == "VIOLATED"
+    assert dx.verify(sol[:50]).ok
+
+
 def test_a_driven_motion_from_rest_has_not_blown_up():
     """Its terms at the start are nothing: the energy came in by the work of the force."""
     driven = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q / 2, forces=lambda t, q, v: jnp.sin(0.7 * t)[None])

@@ -299,6 +299,11 @@ def _run(system, scheme, h: float, time: float, every: int, run: Mapping[str, An
     if not np.all(sol.ok):
         message = sol.message if isinstance(sol.message, str) else next(m for m in sol.message if m)
         raise ValueError(f"the run with steps of {h:g} failed, so no order can be measured: {message}")
+    if sol.rows <= round(time / h) // every or not np.all(np.isfinite(sol.fields["q" if "q" in sol.fields else "x"])):
+        raise ValueError(
+            f"an event has ended the run with steps of {h:g} before t = {float(run.get('t0', 0.0)) + time:g}, and others end at "
+            "other rows, so no order can be measured: leave out the events, or stop before them."
+        )
     return sol
 
 

@@ -19,8 +19,9 @@ from dirax.solution.solution import Solution
 BY_WALLS = 10.0
 """A change in a step that a wall divides is one by the wall where it is so many times that of any other step."""
 
-FAR, BALANCED = 1000.0, 0.1
-"""An energy has blown up that moves by so many times its terms at the start, and by such a part of its terms in the run."""
+FAR, SUDDEN, BALANCED = 1000.0, 10.0, 0.1
+"""An energy has blown up that moves by so many times its terms at the start in a run, or from one row to the next, and by such a
+part of its terms in the run."""
 
 POWER = 1e-9
 """The rate of an energy is none that is such a part of its terms."""
@@ -133,23 +134,25 @@ def _not_kept(sol: Solution) -> Line | None:
 
 
 def _blown_up(sol: Solution, energy: np.ndarray, size: float) -> Line | None:
-    """The line of a run whose energy (B, rows) goes FAR beyond its terms at the start and the work of forces, and is not
-    exchanged with others; None for other runs."""
+    """The line of a run whose energy (B, rows) goes FAR beyond its terms at the start and the work of forces, or does so all of a
+    SUDDEN, and is not exchanged with others; None for other runs."""
     moved = np.nanmax(np.abs(energy - energy[:, :1]), axis=1)
     if sol.system is None or not np.any(moved > BALANCED * size):
         return None
+    at_once = np.nanmax(np.abs(np.diff(energy, axis=1)), axis=1)
     start = np.abs(energy[:, 0]) + np.ravel(sampled_terms(sol, at_rows(sol, energy_at))[:, 0])
     if "work" in sol.fields:  # by which energy has come in
         start = start + np.nanmax(np.abs(np.asarray(sol.fields["work"]).reshape(*energy.shape, -1)), axis=(1, 2))
-    lane = int(np.argmax(np.where(start > 0.0, moved / np.where(start > 0.0, start, 1.0), 0.0)))
-    if not moved[lane] > max(FAR * start[lane], BALANCED * size):
+    far = np.where(at_once > np.maximum(SUDDEN * start, BALANCED * size), SUDDEN, FAR)
+    lane = int(np.argmax(np.where(start > 0.0, moved / far / np.where(start > 0.0, start, 1.0), 0.0)))
+    if not moved[lane] > max(far[lane] * start[lane], BALANCED * size):
         return None
     row = int(np.nanargmax(np.abs(energy[lane] - energy[lane, 0])))
     text = (
         f"it moved by {moved[lane]:.2g} up to t = {sol.time_of(row, lane):.6g}{of_lane(sol, lane)}, and its terms at the start, "
         f"with the work done, are {start[lane]:.2g}: the steps are too long for this motion"
     )
-    return Line("energy", float(moved[lane]), float(FAR * start[lane]), VIOLATED, text)
+    return Line("energy", float(moved[lane]), float(far[lane] * start[lane]), VIOLATED, text)
 
 
 def _changed_by_walls(sol: Solution, energy: np.ndarray, size: float) -> Line | None:

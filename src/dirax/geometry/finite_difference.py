@@ -10,6 +10,7 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from dirax.geometry.linear import LinearDirac
@@ -29,12 +30,19 @@ PhasePoint = Float[Array, " two_n"]
 def annihilator_projector(one_forms: Float[Array, "m n"]) -> Float[Array, "n n"]:
     """The orthogonal projector of V* onto Δ° = image Wᵀ, Δ = ker W: W⁺W, by singular values.
 
-    One-forms that depend on the others do not count, so that W of any rank is accepted; differentiable where the rank
-    is constant.
+    One-forms that depend on the others do not count, whatever units each has, so that W of any rank is accepted; differentiable
+    where the rank is constant.
     """
     if one_forms.shape[0] == 0:
         return jnp.zeros((one_forms.shape[1], one_forms.shape[1]))
-    return pseudo_inverse(one_forms, ONE_FORM_RANK) @ one_forms
+    rows = one_forms / sizes_of_rows(one_forms)
+    return pseudo_inverse(rows, ONE_FORM_RANK) @ rows
+
+
+def sizes_of_rows(one_forms: Float[Array, "m n"]) -> Float[Array, "m 1"]:
+    """The largest number of each row, without a derivative, and 1 for a row of zeros: units, in which one-forms span the same."""
+    sizes = jnp.max(jnp.abs(lax.stop_gradient(one_forms)), axis=1, keepdims=True)
+    return jnp.where(sizes > 0.0, sizes, 1.0)
 
 
 def projector_slope(one_forms: Callable, q: Float[Array, " n"], covector: Float[Array, " n"]) -> Float[Array, "n n"]:
@@ -43,7 +51,9 @@ def projector_slope(one_forms: Callable, q: Float[Array, " n"], covector: Float[
     w = one_forms(q)
     if w.shape[0] == 0:
         return jnp.zeros((q.shape[0], q.shape[0]))
-    inverse, moved = pseudo_inverse(w, ONE_FORM_RANK), jacobian(one_forms)(q)  # (n, m); (m, n, n), by q last
+    units = sizes_of_rows(w)
+    w, moved = w / units, jacobian(lambda q: one_forms(q) / units)(q)  # (m, n); (m, n, n), by q last
+    inverse = pseudo_inverse(w, ONE_FORM_RANK)
     across = jnp.eye(q.shape[0]) - inverse @ w
     first = inverse @ jnp.einsum("mij,i->mj", moved, across @ covector)
     return first + across @ jnp.einsum("mij,m->ij", moved, inverse.T @ covector)

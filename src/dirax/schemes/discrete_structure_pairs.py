@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from dirax.geometry.finite_difference import InducedFiniteDifferenceDirac, annihilator_projector
+from dirax.geometry.finite_difference import InducedFiniteDifferenceDirac, annihilator_projector, sizes_of_rows
 from dirax.geometry.tulczyjew import FiniteDifferenceTriple, slot_derivatives
 from dirax.numerics.arrays import Data
 from dirax.numerics.tolerances import ONE_FORM_RANK
@@ -198,7 +198,8 @@ class LagrangianPairs(AbstractPairs):
             constraint = constraint if plain else self.constraint(first, *pair, params)
 
         jump = p1 + before1
-        of_jump = pseudo_inverse(matrix, ONE_FORM_RANK).T @ jump if matrix.shape[0] else jnp.zeros(0)
+        units = sizes_of_rows(matrix)
+        of_jump = (pseudo_inverse(matrix / units, ONE_FORM_RANK) / units.T).T @ jump if matrix.shape[0] else jnp.zeros(0)
         taken = p - p1 + self.share * jump
         if self.system.holonomic is not None:
             m = self.shape.m

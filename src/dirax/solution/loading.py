@@ -39,9 +39,9 @@ def load(
     rows that are whole of a run that `dx.simulate(…, to=path)` writes or wrote, which are read where they are indexed.
 
     Code is not stored: `system` (and `scheme`, if it is not one of dirax with plain settings) supply it where it is needed,
-    as for `dx.verify`, with the `inputs` of `dx.simulate`; energies and constraint residuals are in the file. `params` replaces the stored parameters: of a class of
-    your own the file has the numbers, as a dict by the names of its fields, and with `system` they have to be given.
-    Loading never executes anything from the file, and takes no more memory than its numbers need.
+    as for `dx.verify`, with the `inputs` of `dx.simulate`; energies and constraint residuals are in the file. `params` replaces
+    the stored parameters: of a class of your own the file has the numbers, as a dict by the names of its fields, and with
+    `system` they have to be given. Loading never executes anything from the file, and takes no more memory than its numbers need.
 
     Raises `FileNotFoundError`, `TypeError` for what is no path, or `ValueError` for a file that dirax did not write, cannot read,
     or that is damaged.
