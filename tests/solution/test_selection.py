@@ -35,6 +35,16 @@ def test_a_trajectory_of_a_batch_is_that_of_a_single_run(batch):
     np.testing.assert_array_equal(part.derived["energy"], batch.energy()[1])
     assert len(batch) == 3 and [float(sol.params["k"]) for sol in batch] == [1.0, 2.0, 3.0]
     np.testing.assert_array_equal(batch[-1].q, batch.q[2])
+    for name in ("newton_iterations", "max_residual"):
+        assert part.stats[name] == alone.stats[name]
+        each = [sol.stats[name] for sol in batch[1:]]
+        assert batch[1:].stats[name] == (sum(each) if name == "newton_iterations" else max(each))
+
+
+def test_a_file_holds_the_iterations_of_the_whole_batch(batch, tmp_path):
+    loaded = dx.load(batch.save(tmp_path / "run.nc"))
+    assert loaded.stats["newton_iterations"] == batch.stats["newton_iterations"]
+    assert "newton_iterations" not in loaded[1].stats and loaded[1].stats["engine"] == "native"
 
 
 def test_several_trajectories_stay_a_batch(batch):

@@ -709,3 +709,16 @@ def test_the_system_is_read_by_its_program(tmp_path):
     table = np.arange(4.0)
     assert first != fingerprint.of_code(lambda x: table + x)
     assert SYSTEM is not None
+
+
+@pytest.mark.parametrize("as_float", [False, True])
+def test_what_keep_sees_of_the_iterations_is_that_of_the_point(tmp_path, as_float):
+    quartic = dx.LagrangeDirac(lambda q, v: v @ v / 2 - jnp.sum(q**4) / 4)
+    number = float if as_float else lambda x: x
+    keep = lambda sol: {"iterations": number(sol.stats["newton_iterations"]), "worst": sol.stats["max_residual"]}
+    run = {"step": 0.2, "steps": 20}
+    over, case = {"a": [0.1, 1.0, 5.0]}, lambda a: {"q": [a], "v": [0.0]}
+    data = dx.sweep(quartic, dx.LagrangeDAlembert(), over=over, case=case, to=tmp_path / "a.zarr", keep=keep, **run)
+    alone = [dx.simulate(quartic, dx.LagrangeDAlembert(), **case(a), **run).stats for a in over["a"]]
+    assert data.iterations.values.tolist() == [stats["newton_iterations"] for stats in alone]
+    assert data.worst.values.tolist() == [stats["max_residual"] for stats in alone]

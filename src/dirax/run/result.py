@@ -13,6 +13,7 @@ from dirax.run.failure_messages import explain, in_few_words
 from dirax.run.validate import Case
 from dirax.schemes.step import AbstractScheme
 from dirax.solution.solution import Solution
+from dirax.solution.trajectory import COUNTS
 from dirax.systems.system import AbstractSystem
 
 EXPLAINED = 32
@@ -48,7 +49,7 @@ def solution_of(
         numbers = np.concatenate([[-1.0], numbers])
     alone = p.batch is None
     fields = {name: fields[name][0] if alone else fields[name] for name in p.fields}
-    return Solution(
+    found = Solution(
         t=times_of(p, numbers, traced),
         fields=fields,
         field_info=p.fields,
@@ -64,6 +65,9 @@ def solution_of(
         batch_params=p.batch_params,
         initial=dict(case.data),
     )
+    if not alone and not traced:
+        found.counts = dict(zip(COUNTS, (outcome.iterations, outcome.max_residual), strict=True))
+    return found
 
 
 def messages(p: Problem, outcome: Outcome, numbers: np.ndarray, said: list[str] | None) -> list[str]:

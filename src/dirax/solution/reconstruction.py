@@ -186,6 +186,7 @@ def _lifted(
         batch_params=solution.batch_params,
         initial=solution.initial,
     )
+    whole.counts = solution.counts
     if (events := solution.events) is not None:
         kept = {name: a for name, a in events.fields.items() if name in fields}
         found = of_events(events.fields, events.lane) | kept

@@ -8,7 +8,7 @@ import numpy as np
 
 from dirax.program.user_functions import is_traced
 from dirax.solution.each_row import each_row
-from dirax.solution.trajectory import ROWS_BEFORE, Some, Trajectory
+from dirax.solution.trajectory import COUNTS, ROWS_BEFORE, Some, Trajectory
 from dirax.text.representation import shortened
 
 SLACK = 1e-6
@@ -129,7 +129,9 @@ def _between_rows(sol: Trajectory, found: Any, rows: range) -> Any:
 def _trajectories(sol: Some, lanes: Any) -> Some:
     """Some trajectories of a batch, as a batch or without its axis."""
     of_batch = lambda a: a[lanes] if np.ndim(a) == 2 else a
+    counts = None if sol.counts is None else {name: each[lanes] for name, each in sol.counts.items()}
     part = sol.replace(
+        stats={name: value for name, value in sol.stats.items() if name not in COUNTS} | totals(counts or {}),
         fields={k: a[lanes] for k, a in sol.fields.items()},
         derived={k: a[lanes] for k, a in sol.derived.items()},
         ok=np.asarray(sol.ok)[lanes] if not is_traced(sol.ok) else sol.ok[lanes],
@@ -139,7 +141,13 @@ def _trajectories(sol: Some, lanes: Any) -> Some:
     )
     part.events = None if sol.events is None else sol.events.of_lanes(lanes)
     part.impacts = None if sol.impacts is None else sol.impacts.of_lanes(lanes)
+    part.counts = counts if counts is not None and part.batch is not None else None
     return part
+
+
+def totals(counts: dict[str, Any]) -> dict[str, Any]:
+    """Of all trajectories together, what `stats` say."""
+    return {name: COUNTS[name](each).item() for name, each in counts.items()}
 
 
 def _trajectory(sol: Some, lane: int) -> Some:

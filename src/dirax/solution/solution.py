@@ -19,7 +19,8 @@ class Solution(Trajectory):
     - `ok` (bool, or (B,) in a batch) and `message` (str, or a list): whether every step was solved, and otherwise which
       step failed and why. What was computed is kept: one trajectory ends at its last good row, in a batch the rows after
       it are NaN.
-    - `stats`: newton_iterations, max_residual, engine, steps, and where the time of the call went: `validate_seconds` (the
+    - `stats`: newton_iterations and max_residual (of a batch the sum and the largest, of `sol[i]` that trajectory's, which files
+      do not hold), engine, steps, and where the time of the call went: `validate_seconds` (the
       arguments), `start_seconds` (initial data completed, premises checked, the equation made), `trace_seconds` (the step as a
       scalar program, and what it is compiled from), `compile_seconds` (machine code, from the disk where it is there),
       `run_seconds` (the steps), `result_seconds` (rows put together, failures explained).

@@ -42,6 +42,12 @@ GIVEN = (
 )
 """What a Trajectory is made of, besides the params."""
 
+BESIDES = ("example", "events", "impacts", "supplied", "counts")
+"""What else is known of one, and of a copy with other values."""
+
+COUNTS = {"newton_iterations": np.sum, "max_residual": np.max}
+"""The `stats` that are made of those of each trajectory of a batch, and how."""
+
 Some = TypeVar("Some", bound="Trajectory")
 
 
@@ -85,6 +91,9 @@ class Trajectory:
     again: Any = None
     """steps ↦ the first so many steps of a run that walls divide, once more from its beginning, with every row; None for other
     runs, and where it is not known how it was run."""
+
+    counts: dict[str, Any] | None = None
+    """The `stats` that are sums or maxima over a batch, (B,) of its trajectories; None where these are not known."""
 
     supplied: bool = False
     """Whether its system was given to `dx.load`, so that it may be another one than that of the run."""
@@ -131,7 +140,7 @@ class Trajectory:
 
     def __getstate__(self) -> dict[str, Any]:
         """What is pickled and copied in depth: no compiled code, so that nothing is known of how the run goes on."""
-        kept = {"axis", "_params", "events", "impacts", "supplied", *GIVEN} - {"t", "equation"}
+        kept = {"axis", "_params", *GIVEN, *BESIDES} - {"t", "equation", "example"}
         return {name: value for name, value in self.__dict__.items() if name in kept}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -144,7 +153,7 @@ class Trajectory:
         """A copy with other values for some of the constructor's arguments."""
         given = {name: getattr(self, name) for name in GIVEN} | {"t": self.axis, "params": self._params}
         copy = type(self)(**(given | changes))
-        copy.example, copy.events, copy.impacts, copy.supplied = self.example, self.events, self.impacts, self.supplied
+        copy.__dict__ |= {name: getattr(self, name) for name in BESIDES}
         return copy
 
     @property

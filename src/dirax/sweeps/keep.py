@@ -215,10 +215,11 @@ class _Together(Solution):
 
 
 def _as_columns(sol: Solution) -> Solution:
-    given = {name: getattr(sol, name) for name in ("field_info", "step", "save_every", "stats", "system", "scheme", "equation")}
+    given = {name: getattr(sol, name) for name in ("field_info", "step", "save_every", "system", "scheme", "equation")}
     params = jax.tree.map(lambda leaf: Column(np.asarray(leaf)), sol.given_params) if sol.batch_params else sol.given_params
     shown = _Together(
         **given,
+        stats=sol.stats | {name: Column(each) for name, each in (sol.counts or {}).items()},
         t=Column(np.broadcast_to(sol.t, (sol.batch or 0, sol.rows))),
         fields={name: Column(np.asarray(a)) for name, a in sol.fields.items()},
         params=params,
