@@ -423,3 +423,51 @@ def test_rules_of_derivatives_are_looked_into():
     captured = Captured(lambda q, v: v @ v / 2 - potential(q))
     own["k"] = 4.0
     assert captured.changed().startswith("own['k'], which was 1.0")
+
+
+class Lazy:
+    """Its masses are found when they are first asked for."""
+
+    def __init__(self, array):
+        self.array = array
+
+    @functools.cached_property
+    def mass(self):
+        return self.array([1.0, 2.0])
+
+    @functools.cached_property
+    def never(self):
+        raise RuntimeError("nothing asks for it")
+
+    def lagrangian(self, q, v):
+        return self.mass[1] * v @ v / 2 - q @ q
+
+
+@pytest.mark.parametrize("array", [np.array, jnp.array], ids=["numpy", "jax"])
+def test_what_an_object_keeps_from_the_first_time_on_has_not_changed(array):
+    model = Lazy(array)
+    system = dx.LagrangeDirac(model.lagrangian)
+    assert [end(system), end(system, engine="xla")] == pytest.approx([np.cos(1.0)] * 2, abs=1e-6)
+    model.__dict__["mass"] = array([1.0, 3.0])
+    with pytest.raises(ValueError, match=r"self\.mass.* which was"):
+        end(system)
+
+
+class Spring:
+    def __init__(self, k):
+        self.k = k
+
+    def lagrangian(self, q, v):
+        return v @ v / 2 - jnp.sum(self.k * q * q) / 2
+
+
+@pytest.mark.parametrize("jitted", [False, True])
+@pytest.mark.parametrize("first", ["native", "xla"])
+def test_an_array_that_is_changed_after_a_run_is_in_no_other_system(first, jitted):
+    """What says the same is traced once: by the numbers of then."""
+    of = lambda k: dx.LagrangeDirac(jax.jit(Spring(k).lagrangian) if jitted else Spring(k).lagrangian)
+    k = np.array([1.0]) if jitted else np.array(1.0)
+    assert end(of(k), engine=first) == pytest.approx(np.cos(1.0), abs=1e-6)
+    k[...] = 4.0
+    assert end(of(np.ones_like(k)), engine="xla") == pytest.approx(np.cos(1.0), abs=1e-6)
+    assert end(of(k), engine="xla") == pytest.approx(np.cos(2.0), abs=1e-5)

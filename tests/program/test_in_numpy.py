@@ -1,5 +1,6 @@
 """Functions through the scalar graph and NumPy against JAX itself: what a start computes without a compiler."""
 
+import itertools
 from typing import Any
 
 import jax
@@ -13,6 +14,7 @@ from dirax.engines.step_program import linearized
 from dirax.program import scalar_program
 from dirax.program.evaluation import in_numpy as module
 from dirax.program.evaluation.functions import in_numpy, program_of
+from dirax.program.graph import Graph, GraphTooLarge
 from dirax.program.linear_solves import LARGE, equilibrated_inverse, pseudo_inverse, pseudo_inverses, scaled_pseudo_inverse, solve
 from dirax.program.roots import nearest_root
 from dirax.program.rules import by_numpy
@@ -181,3 +183,18 @@ def test_what_is_asked_of_the_same_entries_again_is_found_once(name, by, monkeyp
     other = found(np.where(np.arange(7)[:, None, None] == 3, 1.5 * a, a))
     assert len(asked) > once
     np.testing.assert_array_equal(np.all(other == first, axis=1), np.arange(7) != 3)
+
+
+def test_a_step_as_large_as_a_graph_may_be_has_derivatives_in_numbers():
+    graph = Graph(60)
+    x = [graph.input(f"x{i}") for i in range(12)]
+    outputs = [graph.make("cos", graph.mul(a, b)) for a, b in itertools.pairwise(x)]
+    graph.limit = len(graph)
+    known = module.Values(graph, 2)
+    values = np.linspace(0.1, 1.0, 24).reshape(2, 12)
+    known.bind(np.array(x), values)
+    expected = jax.vmap(jax.jacfwd(lambda x: jnp.cos(x[:-1] * x[1:])))(values)
+    np.testing.assert_allclose(known.slopes(outputs, x), expected, atol=1e-15)
+    with pytest.raises(GraphTooLarge):
+        graph.make("sin", x[0])
+        graph.make("tanh", x[0])

@@ -461,3 +461,29 @@ def test_an_exact_corner_is_the_limit_of_near_ones():
     assert exact.ok and len(exact.events) == len(near.events) == 7
     np.testing.assert_allclose(exact.p[-1], near.p[-1], rtol=1e-7)
     np.testing.assert_allclose(exact.energy()[-1], exact.energy()[0], rtol=1e-13)
+
+
+@pytest.mark.parametrize(
+    "scheme", [dx.LagrangeDAlembert(), dx.DiscreteDirac(), dx.VariableSteps(dx.LagrangeDAlembert(), lambda q: 1.0 + 0.0 * q[0])]
+)
+def test_the_step_that_ends_at_an_impact_is_known_inside(scheme):
+    """A ball let go from (k h)²/2 hits the floor at row k, which has the momentum after the impact."""
+    ball = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[0])
+    events = [dx.Impact(lambda q: q[0]), dx.Event(lambda v: v[0])]
+    sol = dx.simulate(ball, scheme, q=[1.125], v=[0.0], step=0.05, steps=40, events=events)
+    t = np.linspace(1.451, 1.549, 12)
+    after = np.maximum(t - 1.5, 0.0)
+    before = np.minimum(t, 1.5)
+    there = sol.at(t)
+    np.testing.assert_allclose(there.q[:, 0], 1.125 - before**2 / 2 + 1.5 * after - after**2 / 2, atol=1e-13)
+    np.testing.assert_allclose(there.p[:, 0], np.where(t < 1.5, -t, 1.5 - after), atol=1e-13)
+    np.testing.assert_allclose(sol.events.t[sol.events.index == 1], 1.5, atol=1e-12)
+    assert dx.verify(sol).ok
+
+
+@pytest.mark.parametrize("k", [5, 16])
+def test_an_impact_at_a_row_is_in_no_flight(k):
+    ball = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[1])
+    run = {"q": [0.0, (k * 0.05) ** 2 / 2], "v": [0.3, 0.0], "step": 0.05, "steps": 70, "events": [dx.Impact(lambda q: q[1])]}
+    report = dx.verify(dx.simulate(ball, dx.DiscreteDirac(), **run))
+    assert report.ok and report["discretization-map Dirac structure"].value < 1e-14

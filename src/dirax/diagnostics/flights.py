@@ -8,6 +8,7 @@ from dirax.diagnostics.report import NOT_CHECKED, OK, VIOLATED, Line
 from dirax.diagnostics.verdicts import of_lane, rows_apart
 from dirax.solution.events import Events
 from dirax.solution.solution import Solution
+from dirax.solution.trajectory import BESIDE_ROW
 
 LONGEST = 2.0
 """Seconds that a run took which is run once more as a whole; of a longer one the first part."""
@@ -20,16 +21,18 @@ from there on."""
 def longest_flight(sol: Solution) -> tuple[Solution, Line | None]:
     """The rows of the longest flight of any trajectory, with a line that says so; the solution itself without impacts.
 
-    It begins a step after the row that a divided step leads to, whose momentum and multipliers are those of both steps.
+    It begins a step after the row that a divided step leads to, whose momentum and multipliers are those of both steps, and ends
+    before a row at which an impact is.
     """
     if sol.impacts is None or not len(sol.impacts) or sol.save_every != 1:
         return sol, None
-    hits, best = sol.impacts, (0, 0, 0)
+    hits, best, near = sol.impacts, (0, 0, 0), BESIDE_ROW * float(sol.step)
     for lane in range(sol.batch or 1):
         own = sol if sol.batch is None else sol[lane]
-        ends = np.searchsorted(sol.times[lane], hits.t[hits.lane == lane], side="right")  # the first rows after the impacts
-        stops = np.concatenate([ends, [own.rows]])
-        starts = np.concatenate([[0], np.minimum(ends + 1, stops[1:] - 1)])
+        t = hits.t[hits.lane == lane]
+        stops = np.append(np.searchsorted(sol.times[lane], t - near, side="left"), own.rows)
+        after = np.searchsorted(sol.times[lane], t + near, side="right")
+        starts = np.append(0, np.minimum(after + 1, stops[1:] - 1))
         longest = int(np.argmax(stops - starts))
         best = max(best, (int((stops - starts)[longest]), lane, int(starts[longest])))
     count, lane, start = best

@@ -5,6 +5,7 @@ Integrability is never required, only measured: nonholonomic constraints give st
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from functools import partial
 from typing import Any, Literal
 
 import equinox as eqx
@@ -212,7 +213,7 @@ def induced_dirac(one_forms: Callable | None, n: int) -> DiracStructure:
     return DiracStructure(Induced(function, n), "two_form" if function is None else "annihilator", 2 * n)
 
 
-@compiled
+@partial(compiled, seldom=True)
 def _courant_tensor(structure: DiracStructure, x: Float[Array, " n"], params: Any) -> Float[Array, "n n n"]:
     def scattering(x):
         return scattering_matrix(structure.kernel(x, params))

@@ -38,12 +38,19 @@ def item(holder: Any, key: Any) -> Any:
 
 
 def attribute(value: Any, name: str) -> Any:
-    """As it is stored: nothing is computed."""
+    """As it is stored: nothing is computed, but what an object keeps from the first time on, which is asked for here so that
+    JAX does not trace it."""
     own = getattr(value, "__dict__", {})
     if name in own:
         return own[name]
     kinds = value.__mro__ if isinstance(value, type) else type(value).__mro__
     found = next((kind.__dict__[name] for kind in kinds if name in kind.__dict__), ABSENT)
+    if isinstance(found, functools.cached_property) and not isinstance(value, type):
+        with jax.ensure_compile_time_eval():
+            try:
+                return getattr(value, name)
+            except Exception:  # it is for the function to raise it, where it asks
+                return ABSENT
     return getattr(value, name, ABSENT) if isinstance(found, types.MemberDescriptorType) else found
 
 

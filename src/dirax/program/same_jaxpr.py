@@ -21,8 +21,47 @@ _seen: Memo[ClosedJaxpr] = Memo(KEPT)
 
 
 def shared(closed: ClosedJaxpr) -> ClosedJaxpr:
-    """The first jaxpr that has the same equations and constants; itself where they cannot be compared."""
-    return _seen.get(Same(closed), lambda: _first.get(_said_by(closed), lambda: closed))
+    """The first jaxpr that has the same equations and constants, as they were then; itself where they cannot be compared."""
+    return _seen.get(Same(closed), lambda: _first.get(_said_by(closed), lambda: with_own_arrays(closed)))
+
+
+def with_own_arrays(closed: ClosedJaxpr) -> ClosedJaxpr:
+    """The jaxpr with copies of the arrays of NumPy that it holds, which are the user's and may be changed."""
+    consts = [_own(c) for c in closed.consts]
+    jaxpr = _with_own_arrays(closed.jaxpr)
+    if jaxpr is closed.jaxpr and all(a is b for a, b in zip(consts, closed.consts, strict=True)):
+        return closed
+    return closed.replace(jaxpr=jaxpr, consts=consts)
+
+
+def _with_own_arrays(jaxpr: Jaxpr) -> Jaxpr:
+    """The same of equations that hold jaxprs."""
+    equations = [_of_equation(e) for e in jaxpr.eqns]
+    same = all(a is b for a, b in zip(equations, jaxpr.eqns, strict=True))
+    return jaxpr if same else jaxpr.replace(eqns=equations)
+
+
+def _of_equation(equation: Any) -> Any:
+    params = {name: _own(value) for name, value in equation.params.items()}
+    atoms = [Literal(_own(a.val), a.aval) if isinstance(a, Literal) and _own(a.val) is not a.val else a for a in equation.invars]
+    changes = {"params": params} if any(params[name] is not value for name, value in equation.params.items()) else {}
+    if any(a is not b for a, b in zip(atoms, equation.invars, strict=True)):
+        changes["invars"] = atoms
+    return equation.replace(**changes) if changes else equation
+
+
+def _own(value: Any) -> Any:
+    """What is held by a jaxpr, with arrays of its own; itself where it has none."""
+    if isinstance(value, np.ndarray):
+        return value.copy()
+    if isinstance(value, ClosedJaxpr):
+        return with_own_arrays(value)
+    if isinstance(value, Jaxpr):
+        return _with_own_arrays(value)
+    if type(value) in (tuple, list):
+        parts = [_own(one) for one in value]
+        return value if all(a is b for a, b in zip(parts, value, strict=True)) else type(value)(parts)
+    return value
 
 
 def _said_by(closed: ClosedJaxpr) -> Any:

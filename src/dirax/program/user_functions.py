@@ -222,7 +222,7 @@ def evaluated(function: Callable, *values: Any) -> Any:
     from dirax.program.evaluation.functions import at_values  # imported when it is used, here and below
 
     found = None if is_traced(values) else at_values(function, values)
-    return compiled(function)(*values) if found is None else found[0]
+    return compiled(function, seldom=True)(*values) if found is None else found[0]
 
 
 def scalar_program(function: Callable, *values: Any) -> Any:

@@ -129,7 +129,7 @@ def _refuse_singular_point(system, matrices, ranks, where, data, params, t0) -> 
     values = np.asarray(system.point(data), float), params, np.asarray(t0, float)
     nearby = _Nearby(Same(system))
     found = at_values(nearby, values)
-    near, left, terms = map(np.asarray, compiled(nearby)(*values) if found is None else found[0])
+    near, left, terms = map(np.asarray, compiled(nearby, seldom=True)(*values) if found is None else found[0])
     bad = np.abs(left) > CONSTRAINT_DEFECT * terms
     if np.any(bad):
         worst = np.where(bad, left, 0.0)
@@ -161,7 +161,7 @@ def _refuse_undetermined_forces(system, matrix, rank, data, params, t0) -> None:
         multipliers = rng.choice([-1.0, 1.0], len(rows)) * rng.uniform(0.5, 1.0, len(rows)) / rows[:, 0]
         values = np.asarray(t0, float), q, moving, multipliers, params
         found = at_values(slope, values)
-        by_unit = np.asarray(compiled(slope)(*values) if found is None else found[0]) / rows.T / columns.T
+        by_unit = np.asarray(compiled(slope, seldom=True)(*values) if found is None else found[0]) / rows.T / columns.T
         if np.max(np.abs(by_unit @ null)) > CONSTRAINT_DEFECT * np.max(np.abs(by_unit)):
             raise ValueError(
                 f"the forces see multipliers that nothing determines: the constraints ({system.constraints.names}) have rank "

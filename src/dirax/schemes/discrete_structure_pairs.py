@@ -23,7 +23,7 @@ from dirax.systems.shape import Shape
 Vector = Float[Array, " n"]
 Scalar = Float[Array, ""]
 
-MANY = 400
+MANY = 128
 """Coordinates above which sizes are those of terms alone where there are no constraints."""
 
 SIGNS = {"+": "(+)-", "-": "(−)-", None: ""}

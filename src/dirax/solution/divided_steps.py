@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from dirax.schemes.step import PART, STEP_DENSITY
+from dirax.solution.trajectory import BESIDE_ROW
 
 AT_ROW = 1e-12
 """Part of a step by which a time may lie off a saved row and still be at it, where steps of a part are taken."""
@@ -27,10 +28,12 @@ class DividedSteps:
         return hits.lane, np.floor(at).astype(np.int64), at - np.floor(at)
 
     def among(self, lanes: np.ndarray, numbers: np.ndarray) -> np.ndarray:
-        """Which of these steps have an impact in them."""
-        of_lanes, of_steps, _ = self.impacts
+        """Which of these steps have an impact in them, or end at one: the row there has the momentum after it."""
+        of_lanes, of_steps, places = self.impacts
+        at_row = (places < BESIDE_ROW) & (of_steps > 0)
+        divided = np.concatenate([of_steps, of_steps[at_row] - 1])
         size = int(self.dense.counts[-1]) + 1
-        return np.isin(lanes * size + numbers, of_lanes * size + of_steps)
+        return np.isin(lanes * size + numbers, np.append(of_lanes, of_lanes[at_row]) * size + divided)
 
     def inside(self, lanes: np.ndarray, numbers: np.ndarray, theta: np.ndarray, hit: np.ndarray) -> dict[str, np.ndarray]:
         """The fields inside steps, some of which walls divide: by the scheme's own step from the last impact before."""

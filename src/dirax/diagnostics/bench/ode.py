@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from dirax.diagnostics.bench.subject import Skipped
 from dirax.numerics.equilibration import equilibrated, geometric_scales
+from dirax.program.linear_solves import solve
 from dirax.program.memo import Same
 from dirax.program.user_functions import evaluated
 from dirax.run.final_manifold import moved_onto
@@ -23,6 +24,10 @@ from dirax.systems.phase_space import PhaseSpaceLagrangian
 from dirax.systems.port_hamiltonian import PortHamiltonian
 from dirax.systems.shape import Shape
 from dirax.systems.system import AbstractSystem
+
+WRITTEN_OUT = 16
+"""Equations up to which elimination is written out in scalars: its operations grow with the third power, and JAX takes half a
+millisecond to trace one."""
 
 SINGULAR = 1e12
 """Condition number from which on the equations do not determine the derivatives."""
@@ -145,7 +150,7 @@ def _on_final_manifold(system: AbstractSystem, data: Mapping[str, Array], params
 
 
 def _solved(equations: LinearEquations, start: Any, shown: int) -> ExplicitODE:
-    """The equations with z eliminated in scalars; the order of the pivots is the one at the start."""
+    """The equations with z eliminated, where there are few in scalars with the order of the pivots as it is at the start."""
     matrix = np.asarray(evaluated(lambda y: equations(0.0, y)[0], jnp.asarray(start)))
     rows, columns = geometric_scales(np.abs(matrix))  # forces and velocities have units of their own
     scaled, _ = equilibrated(matrix / rows / columns)
@@ -155,7 +160,7 @@ def _solved(equations: LinearEquations, start: Any, shown: int) -> ExplicitODE:
 
     def derivative(t, y):
         matrix, right, rate = equations(t, y)
-        return rate(eliminate(matrix, right, order))
+        return rate(eliminate(matrix, right, order) if len(order) <= WRITTEN_OUT else solve(matrix, right))
 
     return ExplicitODE(derivative, np.asarray(start), shown)
 

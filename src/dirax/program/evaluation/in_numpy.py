@@ -111,7 +111,8 @@ class Slopes:
 
     def __init__(self, graph: Graph, nodes: list[int], inputs: list[int], more: Sequence[int] = ()):
         """`more`: nodes whose values will be asked for as well."""
-        moving = set(inputs)
+        moving, limit = set(inputs), graph.limit
+        graph.limit = limit * PARTIALS  # of a graph that has a whole step, what is left is not for these
         self.terms: list[tuple[int, list[tuple[int, int]] | None]] = []
         """Nodes that depend on the inputs, with (operand that does, node of the derivative by it); None for a selection."""
         for node in graph.reachable(nodes):
@@ -124,6 +125,7 @@ class Slopes:
             elif terms := [(a, f) for a, f in slopes(graph, node) if a in moving]:
                 moving.add(node)
                 self.terms.append((node, terms))
+        graph.limit = limit
         self.nodes, self.inputs, self.more, self.graph = nodes, inputs, list(more), graph
         self.backward = len(nodes) < len(inputs) and all(terms is not None for _, terms in self.terms)
         self.needed = [*nodes, *(factor for _, terms in self.terms for _, factor in terms or ())]
@@ -146,6 +148,10 @@ class Slopes:
         if len(self.order.nodes) < FEWEST_NODES or not compiles():
             return None
         return RowTape(self.graph, self.nodes, self.inputs, self.more, self.terms, self.needed, self.backward)
+
+
+PARTIALS = 4
+"""Nodes, at most, for the derivatives of one operation by its operands, and the operation."""
 
 
 def lanes_of(graph: Graph) -> int:
