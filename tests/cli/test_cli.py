@@ -460,3 +460,18 @@ def test_a_file_without_a_scheme_has_the_first_that_suits_it(tmp_path, system, i
     example = from_file(file)
     assert type(example.scheme).__name__ == scheme and example.steps == 20
     assert example.simulate().ok
+
+
+def test_a_file_says_what_else_a_run_takes(tmp_path):
+    file = tmp_path / "ball.py"
+    ball = "import dirax as dx\nsystem = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[0])\nstep, steps = 0.05, 40\n"
+    more = "events = [dx.Impact(lambda q: q[0])]\nt0, save_every = 1.0, 2\n"
+    file.write_text(ball + more + "initial = dict(q=[0.3], v=[0.4])\n", encoding="utf-8")
+    example = from_file(file)
+    sol = example.simulate()
+    assert len(sol.impacts) == 1 and float(sol.t[0]) == 1.0 and sol.rows == 21
+    found = json.loads(call("run", file, "--set", "save_every=1", "--json").stdout)
+    assert found["t"] == 3.0 and any(line["quantity"] == "impacts" for line in found["report"]["lines"])
+    assert "events and walls are not written as C" in call("export", "c", file, "--out", tmp_path / "ball.c").stderr
+    file.write_text(ball + "initial = dict(q=[[0.3], [0.2]], v=[0.4])\n", encoding="utf-8")
+    assert from_file(file).simulate().batch == 2

@@ -1,6 +1,7 @@
 """Several schemes in one table: each number against what is known of the scheme."""
 
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 import dirax as dx
@@ -72,3 +73,10 @@ def test_ctrl_c_in_one_run_ends_the_measurement(measure):
             dx.compare(kepler.system, [dx.LagrangeDAlembert()], step=0.05, steps=200_000, **run)
         else:
             dx.convergence(kepler.system, dx.LagrangeDAlembert(), step_sizes=[0.05, 0.025, 0.0125], time=2000.0, **run)
+
+
+def test_the_energy_of_open_systems_is_less_what_came_in_where_books_are_kept():
+    system = dx.PortHamiltonian(lambda x: x @ x / 2 + x[0] ** 4, [[0.0, 1.0], [-1.0, 0.0]], [[0.0], [1.0]], np.diag([0.0, 0.1]))
+    run = {"x": [1.0, 0.0], "inputs": lambda t, x: 5 * jnp.sin(1.3 * t)[None], "step": 0.05, "steps": 100}
+    (entry,) = dx.compare(system, dx.DiscreteGradient(), **run).entries
+    assert entry.scheme == "DiscreteGradient" and entry.energy_band < 1e-11

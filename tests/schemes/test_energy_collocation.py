@@ -616,3 +616,14 @@ def test_why_no_form_is_checked_is_said_of_moving_constraints_too():
     system = dx.LagrangeDirac(lambda q, v: v @ v / 2, forms, affine=moving)
     sol = dx.simulate(system, dx.EnergyCollocation(2), q=[0.0, 0.0, 0.3], v=[0.0, 0.2, 0.4], step=0.02, steps=10)
     assert "keeps the energy, and no two-form" in dx.verify(sol)["symplecticity of one step"].explanation
+
+
+@pytest.mark.parametrize("place", [1e5, 1e7])
+@pytest.mark.filterwarnings("error")
+def test_far_from_the_origin_the_energy_is_kept_and_said_to_be(place):
+    """Every quadrature of this system is exact; a last place of q changes H by more than roundoff of its terms."""
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - (q[0] - place) ** 2 / 2)
+    sol = dx.simulate(system, dx.EnergyCollocation(2), q=[place + 1.0], v=[0.0], step=0.01, steps=400)
+    assert np.ptp(sol.energy()) < 1e-15 * place and abs(sol.energy()[-1] - 0.5) < 1e-14
+    np.testing.assert_allclose(sol.q[-1, 0] - place, np.cos(4.0), atol=1e-10 + 1e-15 * place)
+    assert dx.verify(sol).ok

@@ -90,3 +90,22 @@ def test_traced_solutions_have_no_table():
         return sol.q[-1, 0]
 
     jax.eval_shape(run, jnp.zeros(3))
+
+
+def test_what_is_no_path_no_units_and_no_solution_is_named(tmp_path):
+    sol = dx.simulate(
+        dx.LagrangeDirac(lambda q, v: v @ v / 2), dx.LagrangeDAlembert(), q=[1.0, 0.0], v=[0.0, 1.0], step=0.1, steps=2
+    )
+    for call in (sol.report, sol.animate, sol.to_csv):
+        with pytest.raises(TypeError, match=r'path must be a text or a pathlib.Path such as "run\..*", but 3 was given'):
+            call(3)
+    for call in (sol.to_xarray, lambda **more: sol.save(tmp_path / "run.nc", **more)):
+        with pytest.raises(TypeError, match=r"units must be a dict by the names of fields"):
+            call(units="m")
+        with pytest.raises(TypeError, match="coordinates must be a list of names"):
+            call(coordinates="ab")
+    with pytest.raises(TypeError, match=r"solution must be a dirax Solution .*, but 3 was given"):
+        dx.reconstruct(3)
+    for nothing, said in (([], r"\[\]"), ([3], "3 in it")):
+        with pytest.raises(TypeError, match=f"or a list of them, but got {said}"):
+            dx.report(nothing, tmp_path / "run.html")

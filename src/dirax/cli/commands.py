@@ -67,8 +67,8 @@ def run(
     """Run a system of the gallery, or of your own file, and verify the structure of the trajectory.
 
     A file defines `system` and `initial`, a dict of initial data (q= and v=, or another pair that dirax.simulate takes), and, if
-    it likes, `scheme`, `step`, `steps` and `params`. The exit status is 1 when the trajectory failed or a structure is violated;
-    a drifting energy is a finding, not a failure.
+    it likes, `scheme`, `step`, `steps`, `params`, `events`, `inputs` and the other arguments of dirax.simulate. The exit status
+    is 1 when the trajectory failed or a structure is violated; a drifting energy is a finding, not a failure.
     """
     from dirax.cli.running import description, message, run_and_verify, saved, summary
     from dirax.cli.schemes import scheme_from_text

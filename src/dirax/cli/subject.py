@@ -3,6 +3,7 @@
 import ast
 import dataclasses
 import difflib
+import inspect
 import os
 import re
 import runpy
@@ -22,6 +23,9 @@ from dirax.text.representation import shortened
 
 INITIAL = ("q", "v", "p", "q0", "q1", "x")
 RUN_OPTIONS = ("save_every", "t0", "max_iterations", "engine", "project", "check_initial")
+IN_FILES = (*RUN_OPTIONS, "inputs", "events", "batch_params", "compensated")
+"""Arguments of `dx.simulate` that `--set` gives, and those that a file may define."""
+
 EXCLUDES = {"v": {"p"}, "p": {"v"}, "q0": {"q", "v", "p"}, "q1": {"q", "v", "p"}, "q": {"q0", "q1"}, "x": {"q", "v", "p"}}
 """Initial data that a newly given one replaces."""
 
@@ -35,8 +39,8 @@ def subject(name: str) -> Example:
 
 
 def from_file(path: Path) -> Example:
-    """Run a user's file and take `system` and `initial` from it, and `scheme`, `step`, `steps`, `params` and `scene` if they
-    are there.
+    """Run a user's file and take `system` and `initial` from it, and `scheme`, `step`, `steps`, `params`, `scene` and other
+    arguments of `dx.simulate` (IN_FILES) if they are there.
 
     Raises `ValueError` where the file fails (with the line) or does not define them, `FileNotFoundError` without a file.
     """
@@ -62,6 +66,7 @@ def from_file(path: Path) -> Example:
         steps=found.get("steps", 1000),
         params=found.get("params"),
         coordinates=(),
+        options={name: found[name] for name in IN_FILES if name in found and not inspect.ismodule(found[name])},
         scene=found.get("scene"),
     )
 
@@ -105,7 +110,7 @@ def changed(example: Example, settings: Sequence[str]) -> tuple[Example, dict[st
     """
     numbers: dict[str, Any] = {}
     initial = {name: np.array(value, dtype=float) if name in INITIAL else value for name, value in example.initial.items()}
-    params, options = example.params, {}
+    params, options = example.params, dict(example.options)
     for setting in settings:
         key, equals, text = setting.partition("=")
         key = key.strip()

@@ -13,6 +13,7 @@ from dirax.diagnostics.convergence import convergence, refuse_tolerance, simulat
 from dirax.diagnostics.drift import judge
 from dirax.diagnostics.energy_lines import energy_less_work, energy_parts, energy_scale
 from dirax.diagnostics.explicit_solution import ExplicitSolution, explicit_solution
+from dirax.diagnostics.power_balance import keeps_books
 from dirax.numerics.arrays import is_whole
 from dirax.numerics.tolerances import EPSILON
 from dirax.program.user_functions import refuse_traced
@@ -36,8 +37,8 @@ class Entry:
     """One scheme's row. `error` is the largest, relative as in `dx.convergence`, over the stretch over which the order was
     measured; None is not known.
 
-    `drift` is the verdict on the energy, less the work of the forces ("bounded", "drifts", "not checked", "not finite"), `slope`
-    its least-squares slope per unit of time.
+    `drift` is the verdict on the energy, less the work of the forces and of ports ("bounded", "drifts", "not checked", "not
+    finite"), `slope` its least-squares slope per unit of time.
     """
 
     scheme: str
@@ -112,7 +113,7 @@ class Comparison:
 
 def compare(
     system: AbstractSystem,
-    schemes: Mapping[str, AbstractScheme] | Sequence[AbstractScheme],
+    schemes: Mapping[str, AbstractScheme] | Sequence[AbstractScheme] | AbstractScheme,
     *,
     step: float,
     steps: int,
@@ -122,15 +123,16 @@ def compare(
 ) -> Comparison:
     """Run every scheme on one system with the same data and tabulate what it costs and what it keeps.
 
-    `schemes`: a dict by name, or a list (named by class). `reference` as in `dx.convergence`; without it, and for systems without
-    explicit equations of motion, each scheme is compared with the refinement of the one whose measured order is highest. The
-    title says which it was, and notes which schemes do not come to it. `run`: initial data and the other keywords
+    `schemes`: a dict by name, a list (named by class), or one. `reference` as in `dx.convergence`; without it, and for systems
+    without explicit equations of motion, each scheme is compared with the refinement of the one whose measured order is highest.
+    The title says which it was, and notes which schemes do not come to it. `run`: initial data and the other keywords
     of `dx.simulate`, one trajectory. Times are medians of `repeats` interleaved runs of compiled code, saving included.
 
     Raises what `dx.simulate` raises for bad data; a scheme that fails midway has that in its row.
     """
     refuse_traced("dx.compare", step, run)
     refuse_tolerance("dx.compare", run)
+    schemes = [schemes] if isinstance(schemes, AbstractScheme) else schemes
     named = dict(schemes) if isinstance(schemes, Mapping) else _named(schemes)
     if not named:
         raise ValueError("schemes must name at least one scheme, but it is empty.")
@@ -193,11 +195,15 @@ def _order(system, scheme, step, steps, reference, run) -> tuple[float | None, t
 
 
 def _energy(sol: Solution) -> tuple | None:
-    """As of `energy_less_work`; None for rows that do not say it."""
+    """As of `energy_less_work`, less what came in by ports where books are kept of it; None for rows that do not say it."""
     try:
-        return energy_less_work(sol)
+        energy, forced, changes = energy_less_work(sol)
     except NotSaved:
         return None
+    if keeps_books(sol):
+        supplied, dissipated = np.moveaxis(np.asarray(sol.fields["work"]), -1, 0)
+        energy = energy - supplied + dissipated
+    return energy, forced, changes
 
 
 def _entry(name: str, sol: Solution, order, precision, note: str, seconds: float) -> Entry:

@@ -33,6 +33,7 @@ class Example:
     - `coordinates`: one `Coordinate` per entry of q or x; `plane`: the two that make a good picture.
     - `exact(t, params=…, **initial) -> (rows, n)`: the solution at times `t` (rows,) from a closed form or a quadrature.
     - `symmetries`: infinitesimal generators `ξ(q) -> (n,)` by name, whose momentum ⟨p, ξ(q)⟩ is conserved.
+    - `options`: other arguments of `dx.simulate`, such as events.
     - `scene`: what a report draws of it, a `dx.scene.Scene`.
     - `model`: the `dx.bodies.Model` that states it, if one does.
 
@@ -54,6 +55,7 @@ class Example:
     plane: tuple[int, int] = (0, 1)
     exact: Callable[..., np.ndarray] | None = None
     symmetries: Mapping[str, Callable] = field(default_factory=dict)
+    options: Mapping[str, Any] = field(default_factory=dict)
     scene: Scene | None = None
     model: Any = None
 
@@ -73,7 +75,7 @@ class Example:
         `params` may be a part of the parameters; the others keep their values. Giving any initial data replaces all of it.
         Raises what `dx.simulate` raises.
         """
-        settings: dict[str, Any] = {"step": self.step, "steps": self.steps}
+        settings: dict[str, Any] = {"step": self.step, "steps": self.steps, **self.options}
         if not {"q", "v", "p", "q0", "q1", "x"} & changes.keys():
             settings.update(self.initial)
         params = changes.pop("params", None)

@@ -44,10 +44,9 @@ def _with_own_arrays(jaxpr: Jaxpr) -> Jaxpr:
 def _of_equation(equation: Any) -> Any:
     params = {name: _own(value) for name, value in equation.params.items()}
     atoms = [Literal(_own(a.val), a.aval) if isinstance(a, Literal) and _own(a.val) is not a.val else a for a in equation.invars]
-    changes = {"params": params} if any(params[name] is not value for name, value in equation.params.items()) else {}
-    if any(a is not b for a, b in zip(atoms, equation.invars, strict=True)):
-        changes["invars"] = atoms
-    return equation.replace(**changes) if changes else equation
+    same = all(params[name] is value for name, value in equation.params.items())
+    same = same and all(a is b for a, b in zip(atoms, equation.invars, strict=True))
+    return equation if same else equation.replace(params=params, invars=atoms)
 
 
 def _own(value: Any) -> Any:

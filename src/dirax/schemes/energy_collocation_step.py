@@ -27,6 +27,10 @@ GIVEN_BACK = 1e-9
 """Changes of the energy in a step, relative to its terms, up to which they are given back in the momenta, so that they do not
 add up over many steps: roundoff, and what is left near a place where the equations are nearly singular."""
 
+FAR = 1e-3
+"""Of what a coordinate as a whole does to the energy, |∂L/∂q| |q|, that is one of its terms: far from the origin the roundoff of
+coordinates is more than that of all others, a millionth of a millionth of this."""
+
 STEEP = 1e-3
 """Of the terms of the energy, ⟨p, v⟩ below which little is given back."""
 
@@ -182,10 +186,10 @@ class EnergyCollocationStep(AbstractStep):
         return replace(super().equation(), collocation=relation)
 
 
-def given_back(left: Any, power: Any, size: Any) -> tuple[Any, Any]:
+def given_back(left: Any, power: Any, size: Any, terms: Any) -> tuple[Any, Any]:
     """What of the energy `left` out in a step is given back, and by which part of themselves the momenta p change for it, with
-    `power` ⟨p, v⟩ and the `size` of the terms of the energy."""
-    kept = jnp.where(jnp.abs(left) <= GIVEN_BACK * size, left, 0.0)
+    `power` ⟨p, v⟩ and the `size` of the energy; `terms` are those by whose roundoff it is off."""
+    kept = jnp.where(jnp.abs(left) <= GIVEN_BACK * terms, left, 0.0)
     return kept, kept * power / _divisor(power * power + (STEEP * size) ** 2)
 
 

@@ -10,7 +10,7 @@ from dirax.program.legendre import constrained_velocity
 from dirax.program.linear_solves import solve
 from dirax.program.tracing import along, gradient, once
 from dirax.program.user_functions import UserFunction, evaluated, is_traced
-from dirax.schemes.energy_collocation_step import EnergyCollocationStep, given_back
+from dirax.schemes.energy_collocation_step import FAR, EnergyCollocationStep, given_back
 from dirax.schemes.lagrangian_energy_collocation_step import NEARLY_DEPENDENT
 from dirax.schemes.layout import Layout
 from dirax.schemes.step import Field
@@ -98,12 +98,14 @@ class FramedEnergyCollocation(EnergyCollocationStep):
     def settle(self, before, after, rate, t, h, params):
         n, then, now = self.shape.n, self.state.split(before), self.state.split(after)
         xi, _ = self.velocity(now.q, now.momentum, rate[:n], params)
-        lagrangian = self.system.lagrangian.at(0.0, now.q, self.frame(now.q, params) @ xi, params)
+        at_place = lambda q: self.system.lagrangian.at(0.0, q, self.frame(q, params) @ xi, params)
+        lagrangian, of_place = at_place(now.q), jnp.abs(gradient(at_place)(now.q)) @ jnp.abs(now.q)
         power = now.momentum @ xi
         energy, size = power - lagrangian, jnp.abs(now.momentum) @ jnp.abs(xi) + jnp.abs(lagrangian)
+        terms = size + FAR * of_place
         work = (now.work - then.work)[0] if self.system.forces is not None else jnp.zeros(())
-        book = self.settled(before, after, energy, work, size)
-        kept, scale = given_back(then.energy + work - energy, power, size)
+        book = self.settled(before, after, energy, work, terms)
+        kept, scale = given_back(then.energy + work - energy, power, size, terms)
         book["energy"] = book["energy"] + kept
         return self.state.join(momentum=scale * now.momentum, **book)
 

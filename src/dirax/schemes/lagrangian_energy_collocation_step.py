@@ -9,7 +9,7 @@ from dirax.numerics.sparse import FEWEST_SPARSE
 from dirax.program.legendre import constrained_velocity
 from dirax.program.linear_solves import solve
 from dirax.program.tracing import along, gradient, jacobian, once
-from dirax.schemes.energy_collocation_step import EnergyCollocationStep, given_back
+from dirax.schemes.energy_collocation_step import FAR, EnergyCollocationStep, given_back
 from dirax.schemes.layout import Layout
 from dirax.schemes.step import Field
 from dirax.systems.lagrange_dirac import LagrangeDirac
@@ -157,12 +157,14 @@ class LagrangianEnergyCollocation(EnergyCollocationStep):
         v, multipliers = self.velocity(t + h, now.q, now.p, rate[: self.n], params)
         rows, offset = self.constraint(t + h, now.q, params)
         moved, given = rows.T @ multipliers, multipliers @ offset
-        lagrangian = self.system.lagrangian.at(t + h, now.q, v, params)
+        at_place = lambda q: self.system.lagrangian.at(t + h, q, v, params)
+        lagrangian, of_place = at_place(now.q), jnp.abs(gradient(at_place)(now.q)) @ jnp.abs(now.q)
         energy, size = (now.p + moved) @ v - lagrangian, jnp.abs(now.p) @ jnp.abs(v) + jnp.abs(lagrangian)
+        terms = size + FAR * of_place
         work = (now.work - self.state.split(before).work)[0] - given if self.working else jnp.zeros(())
         changes = {"work": -given[None]} if self.working else {}
-        book = self.settled(before, after, energy, work, size)
-        kept, scale = given_back(self.state.split(before).energy + work - energy, (now.p + moved) @ v, size)
+        book = self.settled(before, after, energy, work, terms)
+        kept, scale = given_back(self.state.split(before).energy + work - energy, (now.p + moved) @ v, size, terms)
         book["energy"] = book["energy"] + kept
         return self.state.join(p=moved + scale * (now.p + moved), **changes, **book)
 

@@ -13,6 +13,7 @@ from dirax.show import frames, series
 from dirax.show.drawing import Drawing
 from dirax.show.report import PAGES, checked_path, checked_solutions, report
 from dirax.solution.atomic_files import placed
+from dirax.solution.saving import path_of
 from dirax.solution.solution import Solution
 from dirax.solution.style import INK, style
 
@@ -49,7 +50,7 @@ def animate(
 
     Raises `ValueError` for another ending, `RuntimeError` where ffmpeg is missing or fails, and what `sol.report` raises.
     """
-    path = Path(path)
+    path = path_of(path, such="run.gif")
     checked_path(path, ENDINGS, overwrite)
     if path.suffix in PAGES:
         return report(solutions, path, scene=scene, verdicts=False)

@@ -16,7 +16,9 @@ from dirax.show import frames, page, series
 from dirax.show.arrays import Arrays
 from dirax.show.series import Run
 from dirax.solution.atomic_files import checked_place, placed
+from dirax.solution.saving import path_of
 from dirax.solution.solution import Solution
+from dirax.text.representation import shortened
 
 PAGES = (".html", ".htm")
 """Endings of a page."""
@@ -56,7 +58,7 @@ def report(
         sol.report("disk.html")
         dx.report([plus, minus], "both.html", names=["(+)", "(−)"])
     """
-    path = Path(path)
+    path = path_of(path, such="run.html")
     checked_path(path, PAGES, overwrite)
     several = checked_solutions(solutions)
     text = html(several, scene=scene, names=names, title=title, symmetries=symmetries, exact=exact, verdicts=verdicts)
@@ -128,8 +130,8 @@ def checked_solutions(solutions: Any) -> list[Solution]:
     several = [solutions] if isinstance(solutions, Solution) else list(solutions) if isinstance(solutions, Sequence) else []
     others = [sol for sol in several if not isinstance(sol, Solution)]
     if others or not several:
-        what = type(others[0] if others else solutions).__name__
-        raise TypeError(f"solutions must be a dirax Solution (from dx.simulate or dx.load) or a list of them, but got a {what}.")
+        what = f"{shortened(others[0])} in it" if others else shortened(solutions)
+        raise TypeError(f"solutions must be a dirax Solution (from dx.simulate or dx.load) or a list of them, but got {what}.")
     for sol in several:
         sol.refuse_traced("make the report")
     sizes = {tuple((k, sol.fields[k].shape[-1]) for k in ("q", "x") if k in sol.fields) for sol in several}

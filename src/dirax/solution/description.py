@@ -173,6 +173,8 @@ def _dimensions(name: str, dims: Sequence[str], shape: Sequence[int], sizes: dic
 def _checked_units(sol: Trajectory, units: Mapping[str, Any] | None) -> dict[str, Any]:
     if units is None:
         return dict(sol.metadata.get("units", {}))
+    if not isinstance(units, Mapping):
+        raise TypeError(f'units must be a dict by the names of fields such as {{"q": "m"}}, but {units!r:.60} was given.')
     known = ["t", *DERIVED, *sol.fields]
     for name, unit in units.items():
         if name not in known:
@@ -194,6 +196,8 @@ def _unit(units: Mapping[str, Any], name: str) -> str:
 
 
 def _checked_names(sol: Trajectory, coordinates: Sequence[str] | None, count: int) -> list[str]:
+    if isinstance(coordinates, str):
+        raise TypeError(f'coordinates must be a list of names such as ["x", "y"], but {coordinates!r:.60} was given.')
     names = [str(name) for name in (sol.metadata.get("coordinates", ()) if coordinates is None else coordinates)]
     if names and len(names) != count:
         raise ValueError(f"coordinates must hold one name for each of {count} coordinates, but it holds {len(names)}: {names}.")

@@ -10,6 +10,7 @@ import numpy as np
 
 from dirax.solution.atomic_files import placed
 from dirax.solution.description import Variable, describe
+from dirax.solution.saving import path_of
 from dirax.solution.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -79,7 +80,7 @@ def to_csv(sol: Trajectory, path: str | os.PathLike, overwrite: bool = False, co
     Raises `FileExistsError` unless `overwrite`, `FileNotFoundError` where the folder does not exist, and what
     `to_dataframe` raises.
     """
-    columns = _columns(sol, coordinates)
+    path, columns = path_of(path, such="run.csv"), _columns(sol, coordinates)
     rows = len(columns["t"])
     with placed(path, overwrite) as beside, open(beside, "w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
@@ -87,7 +88,7 @@ def to_csv(sol: Trajectory, path: str | os.PathLike, overwrite: bool = False, co
         for first in range(0, rows, BLOCK):
             block = [_cells(column[first : first + BLOCK]) for column in columns.values()]
             writer.writerows(zip(*block, strict=True))
-    return Path(path)
+    return path
 
 
 def _cells(column: np.ndarray) -> list:

@@ -21,6 +21,7 @@ from dirax.solution.events import Events
 from dirax.solution.loading import with_code
 from dirax.solution.solution import Solution
 from dirax.solution.steps_again import Entries
+from dirax.text.representation import shortened
 
 
 def reconstruct(solution: Solution, g0: Any = None) -> Solution:
@@ -37,6 +38,8 @@ def reconstruct(solution: Solution, g0: Any = None) -> Solution:
     Raises `TypeError` for a solution of another system, `ValueError` for a g0 that is no element of the group, and
     for a run on a group by a scheme other than `dx.DiscreteEulerPoincare`, which saves no steps on it.
     """
+    if not isinstance(solution, Solution):
+        raise TypeError(f"solution must be a dirax Solution (from dx.simulate or dx.load), but {shortened(solution)} was given.")
     stated = solution.system
     if stated is not None and (on_algebra := stated.lie_algebra_form()) is not None:
         return _on_group(solution, on_algebra.space.group, on_algebra.space.dimension, g0)
