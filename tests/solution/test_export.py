@@ -102,8 +102,6 @@ def test_what_is_no_path_no_units_and_no_solution_is_named(tmp_path):
     for call in (sol.to_xarray, lambda **more: sol.save(tmp_path / "run.nc", **more)):
         with pytest.raises(TypeError, match=r"units must be a dict by the names of fields"):
             call(units="m")
-        with pytest.raises(TypeError, match="coordinates must be a list of names"):
-            call(coordinates="ab")
     with pytest.raises(TypeError, match=r"solution must be a dirax Solution .*, but 3 was given"):
         dx.reconstruct(3)
     for nothing, said in (([], r"\[\]"), ([3], "3 in it")):

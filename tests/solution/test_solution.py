@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import dirax as dx
-from dirax.solution import trajectory
+from dirax.solution import energy_code, trajectory
+from dirax.solution.trajectory import MANY
 
 SPRING = dx.LagrangeDirac(lambda q, v, params: (params["m"] * (v @ v) - params["k"] * (q @ q)) / 2)
 SKATE = dx.LagrangeDirac(lambda q, v: v @ v / 2, lambda q: jnp.array([[jnp.sin(q[2]), -jnp.cos(q[2]), 0.0]]))
@@ -219,3 +220,24 @@ def test_solutions_are_pickled_and_copied_in_depth(batch):
         assert str(dx.verify(other)) == str(dx.verify(sol))
         with pytest.raises(ValueError, match="knows how to go on"):
             other.extend(3)
+
+
+@pytest.mark.parametrize("batched", [False, True])
+def test_the_energy_of_many_rows_is_that_of_few(batched):
+    """By machine code: (1 + q²) v²/2 + q⁴/4 with p = (1 + q²) v, of which NumPy finds v by Newton's method."""
+    system = dx.LagrangeDirac(lambda q, v, k: (1 + q[0] ** 2) * v[0] ** 2 / 2 - k * q[0] ** 4 / 4)
+    q, k = ([[1.0], [0.5], [0.2]], np.array([1.0, 2.0, 3.0])) if batched else ([1.0], 2.0)
+    run = {"q": q, "v": [0.3], "params": k, "batch_params": batched, "step": 0.01}
+    sol = dx.simulate(system, dx.LagrangeDAlembert(), steps=MANY, **run)
+    x, p = sol.q[..., 0], sol.p[..., 0]
+    expected = p**2 / (1 + x**2) / 2 + (k[:, None] if batched else k) * x**4 / 4
+    np.testing.assert_allclose(sol.energy(), expected, rtol=1e-14)
+    few = dx.simulate(system, dx.LagrangeDAlembert(), steps=100, **run)
+    np.testing.assert_allclose(few.energy(), sol.energy()[..., :101], rtol=1e-14)
+
+
+def test_where_machine_code_and_numpy_disagree_machine_code_is_not_taken(monkeypatch):
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q / 2)
+    sol = dx.simulate(system, dx.LagrangeDAlembert(), q=[1.0], v=[0.0], step=0.1, steps=MANY)
+    monkeypatch.setattr(energy_code, "_run", lambda *_: np.full((1, MANY + 1), 0.5 + 1e-9))
+    np.testing.assert_allclose(sol.energy(), 0.5, rtol=1e-11)

@@ -45,7 +45,7 @@ ROOMS = (
 
 def first_scheme(system: AbstractSystem, initial: Mapping[str, Any], params: Any) -> AbstractScheme:
     """The scheme of a system for which none is named; the very first, which says what it takes, where none suits it."""
-    data = {name: np.asarray(value, float) for name, value in initial.items()}
+    data: dict[str, Any] = {name: np.asarray(value, float) for name, value in initial.items()}
     data = {name: a[0] if a.ndim == 2 and len(a) else a for name, a in data.items()}  # of the first of several trajectories
     shape = Shape(*system.sizes(data, params))
     for name in FIRST:

@@ -15,7 +15,7 @@ from dirax.program.evaluation.noise import Noise
 from dirax.program.side_by_side import of_one, side_by_side, waits
 from dirax.schemes.step import Shape
 from dirax.solution.solution import Solution
-from dirax.solution.trajectory import SavedRow
+from dirax.solution.trajectory import MANY, SavedRow
 from dirax.systems.system import AbstractSystem
 
 CHUNK, CHUNK_NUMBERS = 4096, 2**22
@@ -107,7 +107,7 @@ def sampled_rows(sol: Solution, count: int) -> np.ndarray:
 
 def energy_of(sol: Solution) -> np.ndarray:
     """`sol.energy()`, found here where it was not before. Raises as it does."""
-    own = sol.system is not None and row_numbers(sol) <= LARGE
+    own = sol.system is not None and row_numbers(sol) <= LARGE and sol.rows * (sol.batch or 1) <= MANY
     return _of_nodes(sol, "energy", energy_at) if own else np.asarray(sol.energy())
 
 

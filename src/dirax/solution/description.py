@@ -196,8 +196,6 @@ def _unit(units: Mapping[str, Any], name: str) -> str:
 
 
 def _checked_names(sol: Trajectory, coordinates: Sequence[str] | None, count: int) -> list[str]:
-    if isinstance(coordinates, str):
-        raise TypeError(f'coordinates must be a list of names such as ["x", "y"], but {coordinates!r:.60} was given.')
     names = [str(name) for name in (sol.metadata.get("coordinates", ()) if coordinates is None else coordinates)]
     if names and len(names) != count:
         raise ValueError(f"coordinates must hold one name for each of {count} coordinates, but it holds {len(names)}: {names}.")

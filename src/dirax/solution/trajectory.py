@@ -36,6 +36,9 @@ BLOCK_NUMBERS = 2**22
 BY_NUMPY, NUMBERS_BY_NUMPY = 2**18, 2**24
 """Rows, and numbers in them, up to which NumPy is quicker than to compile for them."""
 
+MANY = 2**15
+"""Rows of all trajectories from which on machine code is made for their energy."""
+
 GIVEN = (
     *("t", "fields", "field_info", "step", "save_every", "stats", "ok", "message", "system", "scheme", "equation"),
     *("batch_params", "initial", "derived", "metadata"),
@@ -329,10 +332,26 @@ class Trajectory:
                     "use dx.load(path, system=system)."
                 )
             function = getattr(self.system, method)
-            values = self._without_compiling(function, (by_value(self.system), method))
+            values = self._of_many() if name == "energy" else None
+            values = self._without_compiling(function, (by_value(self.system), method)) if values is None else values
             values = self.map_rows(function) if values is None else values
             self.derived[name] = values if is_traced(values) else np.asarray(values)
         return self.derived[name]
+
+    def _of_many(self) -> np.ndarray | None:
+        """The energy at every row of a long run by machine code; None for others, and where there is none."""
+        if self.rows * (self.batch or 1) <= MANY or is_traced(self.fields, self._params):
+            return None
+        from dirax.solution.energy_code import energies_of  # and its compiler, where it is used
+
+        def at_rows(rows: list[int]) -> np.ndarray | None:
+            lead = (slice(None),) * (self.batch is not None)
+            some = {k: np.asarray(a)[(*lead, rows)] for k, a in self.fields.items() if self.field_info[k].place == "node"}
+            few = self.replace(t=np.asarray(self.axis)[rows], fields=some)
+            system: Any = self.system
+            return few._without_compiling(system.energy_at, (by_value(system), "energy_at"))
+
+        return energies_of(self, at_rows)
 
     def _without_compiling(self, function: Callable, key: Hashable) -> np.ndarray | None:
         """The array that `function(row, params)` is at every row by its scalar program, which is ready sooner than XLA's; None

@@ -17,6 +17,7 @@ import numpy as np
 from dirax.numerics.arrays import agree, as_type
 from dirax.program.memo import Memo, Same
 from dirax.solution.description import layout_of
+from dirax.solution.energy_code import energy_of, is_quick
 from dirax.solution.solution import Solution
 from dirax.solution.stored import TYPES
 from dirax.solution.sweep_store import MESSAGE, STATUS
@@ -24,7 +25,6 @@ from dirax.solution.trajectory import BLOCK
 from dirax.sweeps.axes import PointError, described
 from dirax.sweeps.case import Values, in_words
 from dirax.sweeps.columns import Column, spread
-from dirax.sweeps.energy import energy_of, is_quick
 from dirax.sweeps.layout import Layout
 
 NAME = re.compile(r"\w[\w \-+.,()\[\]=%]{0,99}")

@@ -1,5 +1,5 @@
-"""The energy at every row of a batch by compiled code: a velocity that belongs to a momentum takes a decomposition of a matrix in
-NumPy, which for some rows would take longer than the steps between them."""
+"""The energy at many rows by compiled code: a velocity that belongs to a momentum takes a decomposition of a matrix in NumPy, and
+a loop in XLA, which for some rows would take longer than the steps between them."""
 
 from collections.abc import Callable
 from typing import Any
@@ -15,13 +15,21 @@ from dirax.program.memo import Memo, by_value
 from dirax.program.rules.linear_algebra import solve_blocks
 from dirax.program.scalar_program import ScalarProgram
 from dirax.program.tracing import jacobian, of_one_result
-from dirax.solution.solution import Solution
 
 SAME = 1e-9
 """How far it may be from `Solution.energy`, relative to the largest energy."""
 
+ROUNDINGS = 1e-13
+"""The same for what is to have no more than roundoff of its own."""
 
-def energy_of(sol: Solution) -> np.ndarray:
+AT_ONCE = 2**18
+"""Rows of all trajectories whose numbers are put side by side at a time."""
+
+COMPARED = 8
+"""Rows of a long run, evenly spread, at which compiled code is compared with what is found without it."""
+
+
+def energy_of(sol: Any) -> np.ndarray:
     """`sol.energy()` (B, rows) of a batch: by compiled code, and as it is where that has no answer."""
     made = _compiled(sol)
     if made is None:
@@ -35,7 +43,21 @@ def energy_of(sol: Solution) -> np.ndarray:
     return found
 
 
-def is_quick(sol: Solution) -> bool:
+def energies_of(sol: Any, at_rows: Callable[[list[int]], np.ndarray | None]) -> np.ndarray | None:
+    """The energy (…, rows) of a long run by compiled code, if it agrees with that `at_rows` of a few numbers, (…, COMPARED); None
+    where it has no answer."""
+    try:
+        made = _compiled(sol)
+    except (ImportError, OSError, RuntimeError):
+        return None
+    rows = np.linspace(0, sol.rows - 1, COMPARED).astype(int).tolist()
+    if made is None or (expected := at_rows(rows)) is None:
+        return None
+    found = made(sol)[0] if sol.batch is None else made(sol)
+    return found if agree(found[..., rows], expected, ROUNDINGS) else None
+
+
+def is_quick(sol: Any) -> bool:
     """Whether the compiled code gives the energy of these trajectories."""
     try:
         made = _compiled(sol)
@@ -47,8 +69,8 @@ def is_quick(sol: Solution) -> bool:
 _functions: Memo[Callable | None] = Memo(16)
 
 
-def _compiled(sol: Solution) -> Callable[[Solution], np.ndarray] | None:
-    """The energies (B, rows) of a batch of solutions like this one; None where their system has no scalar program."""
+def _compiled(sol: Any) -> Callable[[Any], np.ndarray] | None:
+    """The energies (B, rows) of solutions like this one; None where their system has no scalar program."""
     names = tuple(k for k in sol.fields if sol.field_info[k].place == "node")
     leaves, structure = jax.tree.flatten(sol.given_params)
     shapes = tuple(np.shape(leaf)[1:] if sol.batch_params else np.shape(leaf) for leaf in leaves)
@@ -107,14 +129,18 @@ def _affine_root(interpreter: Interpreter, equation: Any, *operands: Nodes) -> l
     return [root]
 
 
-def _run(run: Callable, sol: Solution, names: tuple[str, ...]) -> np.ndarray:
-    lanes, rows = sol.batch or 0, sol.rows
-    columns = [np.asarray(sol.fields[name]).reshape(lanes * rows, -1).T for name in names]
-    columns.append(np.broadcast_to(np.asarray(sol.t), (lanes, sol.rows)).ravel()[None])
-    for leaf in jax.tree.leaves(sol.given_params):
-        values = np.asarray(leaf, dtype=np.float64)
-        if sol.batch_params:
-            columns.append(np.repeat(values.reshape(lanes, -1), rows, axis=0).T)
-        else:
-            columns.append(np.broadcast_to(values.reshape(-1, 1), (values.size, lanes * rows)))
-    return run(np.concatenate(columns)).reshape(lanes, rows)
+def _run(run: Callable, sol: Any, names: tuple[str, ...]) -> np.ndarray:
+    lanes, rows = 1 if sol.batch is None else sol.batch, sol.rows
+    fields = [np.asarray(sol.fields[name]).reshape(lanes * rows, -1) for name in names]
+    times, params = np.asarray(sol.t), [np.asarray(leaf, np.float64) for leaf in jax.tree.leaves(sol.given_params)]
+    found = np.empty(lanes * rows)
+    for low in range(0, lanes * rows, AT_ONCE):
+        entries = np.arange(low, min(low + AT_ONCE, lanes * rows))
+        lane, row = entries // rows, entries % rows
+        columns = [values[entries].T for values in fields]
+        columns.append((times[row] if times.ndim == 1 else times[lane, row])[None])
+        for values in params:
+            own = values.reshape(lanes, -1)[lane].T if sol.batch_params else values.reshape(-1, 1)
+            columns.append(np.broadcast_to(own, (len(own), len(entries))))
+        found[entries] = run(np.concatenate(columns))[0]
+    return found.reshape(lanes, rows)
