@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import dirax as dx
 from dirax.geometry.linear import LinearDirac
 from dirax.geometry.structures import DiracStructure, canonical_two_form, induced_dirac
 from dirax.program.user_functions import constant_entries
@@ -352,3 +353,14 @@ def test_open_ports_keep_their_places():
         first.compose(second, [1], [2])
     with pytest.raises(ValueError, match="cannot be joined"):
         first.compose(second, [1], [0, 1])
+
+
+def test_structures_are_shown_by_their_functions():
+    plane = dx.DiracStructure.from_bivector(lambda x: jnp.array([[0.0, 1.0], [-1.0, 0.0]]), n=2)
+    induced = dx.induced_dirac(lambda q, params: q[None], 2)
+    assert repr(plane) == "DiracStructure(bivector=lambda(x), n=2)"
+    assert repr(dx.induced_dirac(None, 2)) == "DiracStructure(canonical, n=4)"
+    assert repr(induced) == "DiracStructure(induced by one_forms=lambda(q, params), n=4)"
+    assert repr(plane.product(induced)) == f"DiracStructure({plane!r} and {induced!r}, n=6)"
+    assert repr(plane.pull_back(lambda y: y)) == f"DiracStructure(pull-back of {plane!r} by lambda(y))"
+    assert "0x" not in repr(dx.DiracSystem(plane, lambda x: x @ x))

@@ -135,7 +135,7 @@ KNIFE_IN_SPACE = lambda q: jax.jacfwd(lambda v: jax.jvp(SO3.matrix, (q,), (v,))[
     ("make", "kind", "message"),
     [
         (lambda: dx.reduce(dx.ManifoldLagrangian(heavy, SO3), SO3), ValueError,
-         r"lagrangian is not left-invariant on SO3: L\(g, gξ\) − L\(e, ξ\) = -?[0-9.]+ at g = \[.*advected quantity a: write"),
+         r"left-invariant on SO3, whose elements .*: L\(g, gξ\) − L\(e, ξ\) = -?[0-9.]+ at g = \[.*advected quantity a: write"),
         (lambda: dx.reduce(dx.LagrangeDirac(FREE, KNIFE_IN_SPACE), SO3), ValueError, "one_forms are not left-invariant .* by"),
         (lambda: dx.reduce(dx.LagrangeDirac(FREE, holonomic=lambda q: q[:1] - 1.0), SO3), ValueError,
          "holonomic constraints are not those of SO3"),
@@ -172,3 +172,19 @@ def test_what_is_said_of_a_start_on_the_group_with_advected_quantities():
     top = dx.EulerPoincare(SO3, lambda xi, a: xi @ xi / 2 - a[2], advected=3)
     with pytest.raises(ValueError, match=r"starts from x= \(μ, a\) of shape \(3 \+ 3,\), but q, v were given"):
         dx.simulate(top, dx.DiscreteEulerPoincare(), q=[1.0, 0, 0, 0], v=[0.0, 1, 0, 0], step=0.1, steps=1)
+
+
+@pytest.mark.parametrize(
+    ("lagrangian", "one_forms", "said"),
+    [
+        (
+            lambda q, v: v @ v / 2,
+            lambda q: jnp.array([[jnp.sin(q[2]), -jnp.cos(q[2]), 0.0]]),
+            r"but the one_forms have 3 columns",
+        ),
+        (lambda q, v: v @ jnp.diag(jnp.array([1.0, 2.0, 3.0])) @ v / 2, None, r"could not be traced"),
+    ],
+)
+def test_coordinates_that_are_not_those_of_an_element(lagrangian, one_forms, said):
+    with pytest.raises(ValueError, match=r"must be those of an element of SE2, \(cos, sin, x, y\).*" + said):
+        dx.reduce(dx.LagrangeDirac(lagrangian, one_forms), dx.SE2())

@@ -43,6 +43,7 @@ class AbstractLieGroup(AbstractGeodesicManifold):
     rotation_product: eqx.AbstractClassVar[np.ndarray]  # (k, k, k): (r s)_i = Σ rotation_product[i, j, l] r_j s_l
     rotation_basis: eqx.AbstractClassVar[np.ndarray]  # (k, d'): the derivative of exp at 0, on rotations
     translations: eqx.AbstractClassVar[int]
+    element: eqx.AbstractClassVar[str]  # what the numbers of one are, in words
     bi_invariant: eqx.AbstractClassVar[bool]
     double_cover: eqx.AbstractClassVar[bool]
     jaxlie_group: eqx.AbstractClassVar[type[jaxlie.MatrixLieGroup]]

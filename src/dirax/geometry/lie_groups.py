@@ -32,6 +32,7 @@ class SO2(AbstractLieGroup):
     dimension, ambient_dimension, translations = 1, 2, 0
     rotation_product, rotation_basis = _COMPLEX_PRODUCT, _TURN_OF_PLANE
     bi_invariant, double_cover = True, False
+    element = "(cos, sin)"
     jaxlie_group = jaxlie.SO2
 
     def __init__(self): ...
@@ -51,6 +52,7 @@ class SE2(AbstractLieGroup):
     dimension, ambient_dimension, translations = 3, 4, 2
     rotation_product, rotation_basis = _COMPLEX_PRODUCT, _TURN_OF_PLANE
     bi_invariant, double_cover = False, False
+    element = "(cos, sin, x, y)"
     jaxlie_group = jaxlie.SE2
 
     def __init__(self): ...
@@ -79,6 +81,7 @@ class SO3(AbstractLieGroup):
     dimension, ambient_dimension, translations = 3, 4, 0
     rotation_product, rotation_basis = _QUATERNION_PRODUCT, _TURN_OF_SPACE
     bi_invariant, double_cover = True, True
+    element = "a unit quaternion (w, x, y, z)"
     jaxlie_group = jaxlie.SO3
 
     def __init__(self): ...
@@ -98,6 +101,7 @@ class SE3(AbstractLieGroup):
     dimension, ambient_dimension, translations = 6, 7, 3
     rotation_product, rotation_basis = _QUATERNION_PRODUCT, _TURN_OF_SPACE
     bi_invariant, double_cover = False, True
+    element = "(w, x, y, z) of a unit quaternion and a translation"
     jaxlie_group = jaxlie.SE3
 
     def __init__(self): ...

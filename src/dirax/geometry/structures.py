@@ -21,6 +21,7 @@ from dirax.geometry.subspaces import AnyArray, known
 from dirax.numerics.arrays import is_whole
 from dirax.program.compiled import compiled
 from dirax.program.user_functions import UserFunction, constant_entries, is_traced
+from dirax.text.representation import value_text
 
 Matrices = tuple[Float[AnyArray, "rows columns"], ...]
 
@@ -50,6 +51,14 @@ class DiracStructure(eqx.Module):
     ):
         """Called by the constructors: `evaluate(x, params)` gives the matrices of `representation`, see KERNEL_PAIRS."""
         self.evaluate, self.representation, self.n, self.ports = evaluate, representation, n, ports
+
+    def __repr__(self) -> str:
+        more = {"n": self.n, "ports": self.ports or None}
+        said = [
+            getattr(self.evaluate, "text", "") or value_text(self.evaluate),
+            *(f"{name}={value}" for name, value in more.items() if value is not None),
+        ]
+        return f"DiracStructure({', '.join(said)})"
 
     # Constructors
 
@@ -234,6 +243,11 @@ def canonical_two_form(n: int) -> Float[Array, "2*{n} 2*{n}"]:
 class _Functions(eqx.Module):
     functions: tuple[UserFunction, ...]
 
+    @property
+    def text(self) -> str:
+        """The functions by their names."""
+        return ", ".join(f"{function.name}={value_text(function)}" for function in self.functions)
+
     def __call__(self, x, params):
         return tuple(_value(function, x, params) for function in self.functions)
 
@@ -256,6 +270,11 @@ class Induced(eqx.Module):
     one_forms: UserFunction | None
     n: int = eqx.field(static=True)
 
+    @property
+    def text(self) -> str:
+        """The one-forms."""
+        return "canonical" if self.one_forms is None else f"induced by one_forms={value_text(self.one_forms)}"
+
     def __call__(self, x, params):
         form = canonical_two_form(self.n)
         if self.one_forms is None:
@@ -269,6 +288,11 @@ class Induced(eqx.Module):
 class _PullBack(eqx.Module):
     structure: DiracStructure
     point_map: UserFunction
+
+    @property
+    def text(self) -> str:
+        """The structure and the map."""
+        return f"pull-back of {self.structure!r} by {value_text(self.point_map)}"
 
     def __call__(self, y, params):
         def position(y):
@@ -288,6 +312,12 @@ class _Composition(eqx.Module):
     ports: tuple[int, ...] = eqx.field(static=True)
     other_ports: tuple[int, ...] = eqx.field(static=True)
     common: Literal["covectors", "vectors"] = eqx.field(static=True)
+
+    @property
+    def text(self) -> str:
+        """The two, and the ports that they share."""
+        shared = f" over ports {list(self.ports)} and {list(self.other_ports)}" if self.ports else ""
+        return f"{self.first!r} and {self.second!r}{shared}"
 
     def __call__(self, x, params):
         n, m = self.first.n or 0, self.second.n or 0

@@ -28,6 +28,7 @@ def reduced_by_left_translations(system: Any, group: AbstractLieGroup, params: A
             raise TypeError(
                 f"{function.signature} takes params, with which its invariance is checked: dx.reduce(system, group, params=…)."
             )
+    _refuse_other_coordinates(system, group, params)
     _refuse_asymmetry(system, group, params)
     identity = group.identity()
 
@@ -65,6 +66,20 @@ def _refuse_other_systems(system: Any, group: AbstractLieGroup) -> None:
         )
 
 
+def _refuse_other_coordinates(system: Any, group: AbstractLieGroup, params: Any) -> None:
+    """Raise `ValueError` where the functions are not ones of the coordinates of an element."""
+    name, q = type(group).__name__, group.identity()
+    about = f"the coordinates of the system must be those of an element of {name}, {group.element}"
+    try:
+        system.lagrangian.shape(q, q, params)
+        forms = getattr(system, "one_forms", None)
+        columns = q.size if forms is None else forms.shape(q, params).shape[-1]
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{about}: {error}") from error
+    if columns != q.size:
+        raise ValueError(f"{about}, {q.size} numbers, but the one_forms have {columns} columns.")
+
+
 def _nonzero(size: Any) -> Any:
     return jnp.where(size > 0.0, size, 1.0)
 
@@ -99,9 +114,9 @@ def _refuse_asymmetry(system: Any, group: AbstractLieGroup, params: Any) -> None
         where = f"at g = {g[row]}"
         if of == "lagrangian":
             raise ValueError(
-                f"the lagrangian is not left-invariant on {name}: L(g, gξ) − L(e, ξ) = {values[row, 0]:.3g} {where}, "
-                f"ξ = {xi[row]}. A direction or a point in space that L singles out is an advected quantity a: write "
-                f"dx.EulerPoincare({name.lower()}, l(xi, a), advected=…), or leave the term out."
+                f"the lagrangian is not left-invariant on {name}, whose elements are {group.element}: L(g, gξ) − L(e, ξ) = "
+                f"{values[row, 0]:.3g} {where}, ξ = {xi[row]}. A direction or a point in space that L singles out is an advected "
+                f"quantity a: write dx.EulerPoincare({name.lower()}, l(xi, a), advected=…), or leave the term out."
             )
         if of == "one_forms":
             raise ValueError(
