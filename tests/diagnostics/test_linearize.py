@@ -456,3 +456,10 @@ def test_a_coordinate_without_mass_that_a_constraint_moves_is_no_singular_one(sc
     found = dx.linearize(system, {"q": [0.0, 0.0], "v": [0.0, 0.0]}, **step)
     frequency = 1.0 if scheme is None else 2 * np.arctan(0.05) / 0.1
     np.testing.assert_allclose(np.sort(found.eigenvalues.imag), [-frequency, 0.0, frequency], atol=1e-9)
+
+
+def test_steps_of_their_own_length_are_not_linearized():
+    oscillator = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q / 2)
+    with pytest.raises(TypeError, match=r"dx\.VariableSteps has steps of their own length"):
+        scheme = dx.VariableSteps(dx.LagrangeDAlembert(), lambda q: 1 + q @ q)
+        dx.linearize(oscillator, {"q": [0.0], "v": [0.0]}, scheme, step=0.1)

@@ -18,7 +18,12 @@ needs_compiler = pytest.mark.skipif(COMPILER is None, reason="there is no C comp
 
 def rows_of(path, *arguments):
     """The columns that the program prints, by name; and its exit status."""
-    flags = ["-O0", "-ffp-contract=off", *["-mfma"] * (llvm.has_fma() and llvm.host()[0].startswith("x86_64"))]
+    flags = [
+        "-O0",
+        "-ffp-contract=off",
+        "-Werror=unused-label",
+        *["-mfma"] * (llvm.has_fma() and llvm.host()[0].startswith("x86_64")),
+    ]
     program = path.with_suffix("")
     subprocess.run([COMPILER, *flags, "-o", program, path, "-lm"], check=True)
     run = subprocess.run([program, *arguments], capture_output=True, text=True)

@@ -726,3 +726,14 @@ def test_params_that_change_what_they_are_made_of_are_refused():
     for angle in (90.0, np.float32(90.0)):
         given = {"system": system, "params": {"slope": Degrees(angle)}}
         complaint(ValueError, "params['slope'].angle is 1.5707963", "but 0.0274155", **given)
+
+
+@pytest.mark.parametrize(
+    "scheme", [dx.LagrangeDAlembert(), dx.DiscreteDirac(), dx.Collocation(2)], ids=lambda s: type(s).__name__
+)
+def test_a_step_that_leads_out_of_the_domain_is_told_from_data_outside(scheme):
+    falling = dx.LagrangeDirac(lambda q, v: v @ v / 2 + jnp.sqrt(q[0]))
+    with pytest.raises(ValueError, match=r"first step is not finite .* the step is too long: it leads out of the domain"):
+        dx.simulate(falling, scheme, q=[1.0], v=[-1.0], step=5.0, steps=3)
+    with pytest.raises(ValueError, match="the data lie outside"):
+        dx.simulate(falling, scheme, q=[-1.0], v=[0.0], step=0.1, steps=3)

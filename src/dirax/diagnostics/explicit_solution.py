@@ -35,6 +35,9 @@ MOST_EVALUATIONS = 3_000_000
 FIRST_EVALUATIONS = 20_000
 """After so many it is foreseen how many the whole takes."""
 
+MOST_COMPILED = 10_000
+"""Operations of the derivative from which on XLA is sooner ready, which has products of matrices."""
+
 MOST_BY_JAX = 200_000
 """The same where XLA evaluates it."""
 
@@ -69,8 +72,8 @@ class ExplicitSolution:
         except ImportError:
             raise Skipped("needs llvmlite") from None
         try:
-            return compiled_field(self.ode)
-        except Skipped:  # a root in it, or a decomposition
+            return compiled_field(self.ode, MOST_COMPILED)
+        except Skipped:  # a root in it, a decomposition, or large matrices
             return _field_by_jax(self.ode)
 
     def _solved(self, t: np.ndarray) -> dict[str, np.ndarray]:

@@ -21,7 +21,7 @@ from dirax.run.start import begun, completed
 from dirax.run.validate import Case, validated_case
 from dirax.schemes.collision_step import SUMS
 from dirax.schemes.layout import Layout
-from dirax.schemes.step import AbstractScheme, make_step_equation
+from dirax.schemes.step import CLOCK, AbstractScheme, make_step_equation
 from dirax.schemes.work_of_forces import BEYOND
 from dirax.systems.shape import Shape
 from dirax.systems.system import AbstractSystem
@@ -98,6 +98,11 @@ def linearized_step(
     shape = Shape(*system.sizes(dict(case.data), case.params))
     redundant = redundant_constraints(system, initial.constraints, dict(case.data), case.params, case.t0)
     equation = make_step_equation(scheme, system, Shape(shape.n, shape.m, shape.c, redundant=redundant))
+    if CLOCK in equation.fields:
+        raise TypeError(
+            f"dx.{type(scheme).__name__} has steps of their own length, whose clock goes on at an equilibrium too: linearize a "
+            "step of the scheme in it."
+        )
     equation = lifted(equation, case.params, case.batch_params)
     began = begun(equation, case, initial)
     first = np.asarray(began.state)

@@ -134,7 +134,10 @@ def _refuse_singular_step(
                 f"the first step is not finite at the initial data{_which(~finite)}, since the Lagrangian is singular (∂²L/∂v²), "
                 f"and this scheme {needed()}."
             )
-        row = int(np.argmin(rows[np.argmin(finite)]))
+        lane = int(np.argmin(finite))
+        if shorter and not sparse and np.all(np.isfinite(_lanes(shorter(), 2)[lane])):
+            outside = "the step is too long: it leads out of the domain of the system's functions, and a shorter one does not"
+        row = int(np.argmin(rows[lane]))
         raise ValueError(f"the first step is not finite at the initial data{_which(~finite)} (in {labels[row]}): {outside}.")
     if sparse:
         return _refuse_singular_sparse_step(start.jacobian, labels, shorter)

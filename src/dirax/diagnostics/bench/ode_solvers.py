@@ -140,9 +140,12 @@ def field_graph(ode: ExplicitODE) -> tuple[Graph, list[int], list[int]]:
     return graph, inputs, rates.tolist()
 
 
-def compiled_field(ode: ExplicitODE) -> Callable[[float, np.ndarray], np.ndarray]:
-    """(t, y) ↦ ẏ on NumPy arrays, compiled; about as cheap as a call from Python can be."""
+def compiled_field(ode: ExplicitODE, most: int | None = None) -> Callable[[float, np.ndarray], np.ndarray]:
+    """(t, y) ↦ ẏ on NumPy arrays, compiled; about as cheap as a call from Python can be. Raises `Skipped`, also for more than
+    `most` operations, a thousand of which take LLVM half a second."""
     graph, inputs, outputs = field_graph(ode)
+    if most is not None and len(graph.reachable(outputs)) > most:
+        raise Skipped(f"its equations have more than {most} operations")
     call = loaded(graph, inputs, outputs)
     given, rates = np.empty(len(inputs)), np.empty(len(outputs))
     pointers = given.ctypes.data, rates.ctypes.data

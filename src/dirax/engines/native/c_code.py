@@ -28,6 +28,11 @@ HELPERS = """\
 #include <stdlib.h>
 #include <string.h>
 
+#if defined(__GNUC__)
+#pragma GCC diagnostic ignored "-Wunused-but-set-variable"
+#pragma GCC diagnostic ignored "-Wunused-function"
+#endif
+
 static double of_bits(int64_t i) { double x; memcpy(&x, &i, 8); return x; }
 static int64_t bits_of(double x) { int64_t i; memcpy(&i, &x, 8); return i; }
 static double roundeven_(double x) {
@@ -130,7 +135,8 @@ def c_code(module: str) -> str:
             continue
         elif line.endswith(":"):
             block = line[:-1]
-            function.lines.append(f"{_label(block)}: ;")
+            if block != "entry":  # to which nothing jumps
+                function.lines.append(f"{_label(block)}: ;")
         else:
             _statement(function, line, block, phis)
     return "\n".join(parts)
