@@ -241,3 +241,16 @@ def test_where_machine_code_and_numpy_disagree_machine_code_is_not_taken(monkeyp
     sol = dx.simulate(system, dx.LagrangeDAlembert(), q=[1.0], v=[0.0], step=0.1, steps=MANY)
     monkeypatch.setattr(energy_code, "_run", lambda *_: np.full((1, MANY + 1), 0.5 + 1e-9))
     np.testing.assert_allclose(sol.energy(), 0.5, rtol=1e-11)
+
+
+def test_rows_of_which_machine_code_has_no_energy_are_not_lost():
+    """The mass of the second coordinate is zero at q = 0, and its momentum too: NumPy finds the smallest velocity."""
+    system = dx.LagrangeDirac(lambda q, v: v[0] ** 2 / 2 + q[0] ** 2 * v[1] ** 2 / 2)
+    count = MANY + 1
+    q, p = np.linspace(0.0, 1.0, 2 * count).reshape(2, count).T.copy(), np.ones((count, 2))
+    q[100], p[100] = 0.0, [1.0, 0.0]
+    sol = dx.simulate(system, dx.LagrangeDAlembert(), q=[1.0, 0.0], v=[0.0, 0.0], step=0.1, steps=MANY)
+    changed = sol.replace(fields={**sol.fields, "q": q, "p": p})
+    found = changed.energy()
+    assert np.all(np.isfinite(found))
+    np.testing.assert_allclose(found[90:110], changed[90:110].energy(), rtol=1e-12)

@@ -35,12 +35,16 @@ def energy_of(sol: Any) -> np.ndarray:
     if made is None:
         return np.asarray(sol.energy())
     found = made(sol)
-    nodes = [np.asarray(a).reshape(*found.shape, -1) for k, a in sol.fields.items() if sol.field_info[k].place == "node"]
-    there = np.all(np.isfinite(np.concatenate(nodes, axis=-1)), axis=-1)
-    lost = np.flatnonzero(np.any(there & ~np.isfinite(found), axis=1))
-    if len(lost):  # where a matrix is singular
+    if len(lost := np.flatnonzero(_lost(sol, found))):
         found[lost] = sol[lost].energy()
     return found
+
+
+def _lost(sol: Any, found: np.ndarray) -> np.ndarray:
+    """Which trajectories (B,) have rows without an energy (B, rows), though they were computed: where a matrix is singular."""
+    nodes = [np.asarray(a).reshape(*found.shape, -1) for k, a in sol.fields.items() if sol.field_info[k].place == "node"]
+    there = np.logical_and.reduce([np.all(np.isfinite(a), axis=-1) for a in nodes])
+    return np.any(there & ~np.isfinite(found), axis=1)
 
 
 def energies_of(sol: Any, at_rows: Callable[[list[int]], np.ndarray | None]) -> np.ndarray | None:
@@ -53,7 +57,10 @@ def energies_of(sol: Any, at_rows: Callable[[list[int]], np.ndarray | None]) -> 
     rows = np.linspace(0, sol.rows - 1, COMPARED).astype(int).tolist()
     if made is None or (expected := at_rows(rows)) is None:
         return None
-    found = made(sol)[0] if sol.batch is None else made(sol)
+    found = made(sol)
+    if np.any(_lost(sol, found)):
+        return None
+    found = found[0] if sol.batch is None else found
     return found if agree(found[..., rows], expected, ROUNDINGS) else None
 
 
