@@ -3,6 +3,7 @@
 import collections
 import functools
 import pickle
+import sys
 import types
 
 import equinox as eqx
@@ -471,3 +472,63 @@ def test_an_array_that_is_changed_after_a_run_is_in_no_other_system(first, jitte
     k[...] = 4.0
     assert end(of(np.ones_like(k)), engine="xla") == pytest.approx(np.cos(1.0), abs=1e-6)
     assert end(of(k), engine="xla") == pytest.approx(np.cos(2.0), abs=1e-5)
+
+
+def by_own_attribute(q, v):
+    return v @ v / 2 - by_own_attribute.k * q @ q / 2
+
+
+def by_import(q, v):
+    from a_module_of_numbers import k
+
+    return v @ v / 2 - k * q @ q / 2
+
+
+def by_what_is_defined_later(q, v):
+    return v @ v / 2 - defined_later * q @ q / 2
+
+
+class Box:
+    """A configuration that answers for its attributes."""
+
+    def __init__(self, **entries):
+        self.entries = entries
+
+    def __getattr__(self, name):
+        return self.__dict__["entries"][name]
+
+
+number, box = types.SimpleNamespace(k=1.0), Box(k=1.0)
+FORCES = {"spring": lambda holder, q: holder.k * q @ q / 2}
+
+
+def set_to(k):
+    by_own_attribute.k = number.k = box.entries["k"] = k
+    module = sys.modules.setdefault("a_module_of_numbers", types.ModuleType("a_module_of_numbers"))
+    module.k = globals()["defined_later"] = k
+
+
+@pytest.mark.parametrize(
+    "lagrangian",
+    [
+        by_own_attribute,
+        by_import,
+        by_what_is_defined_later,
+        lambda q, v: v @ v / 2 - FORCES["spring"](number, q),
+        lambda q, v: v @ v / 2 - getattr(number, "k") * q @ q / 2,  # noqa: B009
+        lambda q, v: v @ v / 2 - vars(number)["k"] * q @ q / 2,
+        lambda q, v: v @ v / 2 - box.k * q @ q / 2,
+    ],
+    ids=["its own attribute", "an import", "defined later", "by a function in a table", "getattr", "vars", "a box"],
+)
+def test_ways_to_read_a_number(lagrangian):
+    globals().pop("defined_later", None)
+    early, later = dx.LagrangeDirac(lagrangian), lagrangian is by_what_is_defined_later
+    set_to(1.0)
+    systems = [dx.LagrangeDirac(lagrangian), *[early] * later]
+    assert list(map(end, systems)) == pytest.approx([np.cos(1.0)] * len(systems), abs=1e-6)
+    set_to(4.0)
+    for old in systems:
+        with pytest.raises(ValueError, match=r"reads .*(k|defined_later).*, which was 1\.0 .* and is 4\.0 now"):
+            end(old)
+    assert end(dx.LagrangeDirac(lagrangian)) == pytest.approx(np.cos(2.0), abs=1e-5)

@@ -5,8 +5,10 @@ or an entry of an array would be seen by no later run, so that runs ask whether 
 """
 
 import argparse
+import builtins
 import functools
 import itertools
+import sys
 import types
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -23,6 +25,7 @@ from dirax.program.outside_values import (
     ABSENT,
     LIBRARIES,
     NOT_OF_VALUES,
+    answer,
     attribute,
     beside_inner,
     contents,
@@ -47,6 +50,9 @@ COPIED, LARGEST = 2**20, 2**28
 
 SPACES = types.SimpleNamespace, argparse.Namespace
 """Objects that are but their attributes."""
+
+IN_CONTAINERS = 2
+"""How deep in containers functions are looked for."""
 
 PLAIN = (bool, int, float, complex, str, bytes, type(None), np.generic)
 
@@ -93,8 +99,11 @@ class Captured:
 
     def changed(self) -> str:
         """In words, one value that is not what it was; "" where all are."""
-        for words, read, before in self.watched:
+        for i, (words, read, before) in enumerate(self.watched):
             if (now := read()) is not before and not _alike(now, before):
+                if before is ABSENT:  # a name that is defined after the function
+                    self._fill(i, now)
+                    continue
                 if isinstance(before, Contents):
                     return f"{words}, in which there is something else than when it was stated"
                 if isinstance(before, types.CodeType):
@@ -102,9 +111,18 @@ class Captured:
                 return f"{words}, which was {_short(before)} when it was stated and is {_short(now)} now"
         return ""
 
-    def _watch(self, words: str, read: Callable[[], Any], names: frozenset[str], depth: int) -> None:
+    def _fill(self, number: int, value: Any) -> None:
+        """Watch a name that has a value now."""
+        words, read, _ = self.watched[number]
+        names = _attributes(self.function, set()) if isinstance(self.function, types.FunctionType) else frozenset()
+        self.watched[number], self._seen = Watched(words, read, value), set()
+        self._follow(value, words, names, 1)
+        del self._seen
+
+    def _watch(self, words: str, read: Callable[[], Any], names: frozenset[str], depth: int, filled: bool = True) -> None:
+        """`filled`: a name without a value is none, and does not get one."""
         value = read()
-        if value is ABSENT or len(self.watched) >= MOST:
+        if (value is ABSENT and filled) or len(self.watched) >= MOST:
             return
         self.watched.append(Watched(words, read, value))
         self._follow(value, words, names, depth + 1)
@@ -154,7 +172,7 @@ class Captured:
 
     def _follow_object(self, value: Any, words: str, names: frozenset[str], depth: int) -> None:
         """By the attributes that code reads, of one of a library's or without any by what it is written as."""
-        is_object, count = not isinstance(value, type | types.ModuleType), len(self.watched)
+        is_object, count, asked = not isinstance(value, type | types.ModuleType), len(self.watched), names
         if not is_of_library(value):
             if is_object and is_installed(type(value)):
                 names = names & getattr(value, "__dict__", {}).keys()
@@ -167,6 +185,10 @@ class Captured:
                     self._follow(held, whole, names, depth + 1)
                 elif not frozen:
                     self._watch(whole, read, names, depth)
+            if is_object and not frozen and hasattr(type(value), "__getattr__"):  # boxes, whose attributes are what they say
+                for name in sorted(asked):
+                    if attribute(value, name) is ABSENT and not name.startswith("__"):
+                        self._watch(f"{words}.{name}", functools.partial(answer, value, name), names, depth)
         if is_object and len(self.watched) == count and not callable(value) and root_of(value) not in NOT_OF_VALUES:
             self._by_contents(words, lambda: written(value))
 
@@ -181,8 +203,11 @@ class Captured:
         names = _attributes(function, set())
         for part in (*(function.__defaults__ or ()), *(function.__kwdefaults__ or {}).values()):
             self._follow(part, "a default", names, depth + 1)
+        of_itself = function.__name__ in reads(function.__code__).globals
+        for name in sorted(names if of_itself else names & vars(function).keys()):
+            self._watch(f"{words}.{name}", functools.partial(item, vars(function), name), names, depth, filled=not of_itself)
         for name, read in _outside(function):
-            self._watch(name, read, names, depth)
+            self._watch(name, read, names, depth, filled=False)
 
     def _by_contents(self, words: str, to_bytes: Callable[[], Any]) -> None:
         """Watch a digest of bytes, where they can be had."""
@@ -207,8 +232,11 @@ def _outside(function: types.FunctionType) -> Iterator[tuple[str, Callable[[], A
             yield name, functools.partial(contents, cell)
     if package_of(function) != "dirax":
         for name in sorted(found.globals - records):
-            if name in function.__globals__:
+            if name in function.__globals__ or not hasattr(builtins, name):
                 yield name, functools.partial(item, function.__globals__, name)
+        for name in sorted(found.modules):
+            if name in sys.modules and not is_of_library(sys.modules[name]):
+                yield name, functools.partial(item, sys.modules, name)
 
 
 def _attributes(function: types.FunctionType, seen: set[int]) -> frozenset[str]:
@@ -216,10 +244,20 @@ def _attributes(function: types.FunctionType, seen: set[int]) -> frozenset[str]:
     seen.add(id(function))
     found = reads(function.__code__).others
     for _, read in _outside(function):
-        other = inner(read())
-        if isinstance(other, types.FunctionType) and id(other) not in seen and package_of(other) not in LIBRARIES | {"dirax"}:
-            found |= _attributes(other, seen)
+        for other in _functions_among(read()):
+            if id(other) not in seen and package_of(other) not in LIBRARIES | {"dirax"}:
+                found |= _attributes(other, seen)
     return found
+
+
+def _functions_among(value: Any, depth: int = 0) -> Iterator[types.FunctionType]:
+    """A function, or those in lists, tuples and dictionaries."""
+    other = inner(value)
+    if isinstance(other, types.FunctionType):
+        yield other
+    elif depth < IN_CONTAINERS and isinstance(value, list | tuple | dict):
+        for part in itertools.islice(value.values() if isinstance(value, dict) else value, MOST):
+            yield from _functions_among(part, depth + 1)
 
 
 class ReadsChanged(ValueError):

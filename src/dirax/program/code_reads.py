@@ -13,17 +13,28 @@ Chain = tuple[str, ...]
 
 OWN: Chain = ("",)
 
+KINDS = {
+    **{"LOAD_NAME": "LOAD_GLOBAL", "LOAD_METHOD": "LOAD_ATTR", "IMPORT_FROM": "LOAD_ATTR"},
+    **{"STORE_GLOBAL": "STORE", "STORE_DEREF": "STORE"},
+}
+"""Instructions that read or set as another one does."""
+
 NAMES = {"LOAD_GLOBAL", "LOAD_NAME", "LOAD_DEREF", "LOAD_CLASSDEREF", "LOAD_FROM_DICT_OR_DEREF"}
 
 
+BY_TEXT = {"getattr", "attrgetter", "vars", "__dict__"}
+"""By which attributes are read whose names are texts."""
+
+
 class Reads(NamedTuple):
-    """The names that code reads as globals and as attributes, those that it sets, and those of what it changes: in which it may
-    keep a record."""
+    """The names that code reads as globals and as attributes, those that it sets, those of what it changes, in which it may keep
+    a record, and those of the modules that it imports."""
 
     globals: frozenset[str]
     attributes: frozenset[str]
     own: frozenset[str]
     changed: frozenset[str]
+    modules: frozenset[str]
 
     @property
     def others(self) -> frozenset[str]:
@@ -35,10 +46,12 @@ class Reads(NamedTuple):
 def reads(code: types.CodeType) -> Reads:
     """Of code and of the functions inside it."""
     names: dict[str, set[str]] = {"LOAD_GLOBAL": set(), "LOAD_ATTR": set(), "STORE": set(), "CHANGED": _changed(code)}
+    names["IMPORT_NAME"] = set()
     for i in dis.get_instructions(code):
-        kind = {"LOAD_NAME": "LOAD_GLOBAL", "LOAD_METHOD": "LOAD_ATTR", "STORE_GLOBAL": "STORE", "STORE_DEREF": "STORE"}
-        if (place := kind.get(i.opname, i.opname)) in names:
+        if (place := KINDS.get(i.opname, i.opname)) in names:
             names[place].add(i.argval)
+    if not BY_TEXT.isdisjoint(names["LOAD_GLOBAL"] | names["LOAD_ATTR"]):
+        names["LOAD_ATTR"].update(text for text in code.co_consts if isinstance(text, str) and text.isidentifier())
     inner = [reads(c) for c in code.co_consts if isinstance(c, types.CodeType)]
     whole = zip(names.values(), Reads._fields, strict=True)
     return Reads(*(frozenset(own).union(*(getattr(r, name) for r in inner)) for own, name in whole))
