@@ -5,7 +5,8 @@ import itertools
 import math
 import operator
 import struct
-from collections.abc import Callable, Container, Iterable, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, ClassVar, cast
 
@@ -57,6 +58,15 @@ class Graph:
         other.op, other.args, other.value = self.op.copy(), self.args.copy(), self.value.copy()
         other.slopes, other.at_rest, other._known = self.slopes.copy(), self.at_rest.copy(), self._known.copy()
         return other
+
+    @contextmanager
+    def with_limit(self, limit: int) -> Iterator[None]:
+        """Another limit, within."""
+        before, self.limit = self.limit, limit
+        try:
+            yield
+        finally:
+            self.limit = before
 
     # ------------------------------------------------------------------ leaves
 

@@ -28,8 +28,8 @@ GIVEN_BACK = 1e-9
 add up over many steps: roundoff, and what is left near a place where the equations are nearly singular."""
 
 FAR = 1e-3
-"""Of what a coordinate as a whole does to the energy, |∂L/∂q| |q|, that is one of its terms: far from the origin the roundoff of
-coordinates is more than that of all others, a millionth of a millionth of this."""
+"""The part of |∂L/∂q| |q| that counts among the terms of the energy: far from the origin a last place of q changes the energy by
+more than roundoff of the others, by ε |∂L/∂q| |q|, and this lets no more than that pass."""
 
 STEEP = 1e-3
 """Of the terms of the energy, ⟨p, v⟩ below which little is given back."""

@@ -111,21 +111,20 @@ class Slopes:
 
     def __init__(self, graph: Graph, nodes: list[int], inputs: list[int], more: Sequence[int] = ()):
         """`more`: nodes whose values will be asked for as well."""
-        moving, limit = set(inputs), graph.limit
-        graph.limit = limit * PARTIALS  # of a graph that has a whole step, what is left is not for these
+        moving = set(inputs)
         self.terms: list[tuple[int, list[tuple[int, int]] | None]] = []
         """Nodes that depend on the inputs, with (operand that does, node of the derivative by it); None for a selection."""
-        for node in graph.reachable(nodes):
-            args = graph.args[node]
-            if node in moving or not any([a in moving for a in args]):
-                continue
-            if graph.op[node] == "select":
-                moving.add(node)
-                self.terms.append((node, None))
-            elif terms := [(a, f) for a, f in slopes(graph, node) if a in moving]:
-                moving.add(node)
-                self.terms.append((node, terms))
-        graph.limit = limit
+        with graph.with_limit(PARTIALS * graph.limit):  # what a large step has left is not for these
+            for node in graph.reachable(nodes):
+                args = graph.args[node]
+                if node in moving or not any([a in moving for a in args]):
+                    continue
+                if graph.op[node] == "select":
+                    moving.add(node)
+                    self.terms.append((node, None))
+                elif terms := [(a, f) for a, f in slopes(graph, node) if a in moving]:
+                    moving.add(node)
+                    self.terms.append((node, terms))
         self.nodes, self.inputs, self.more, self.graph = nodes, inputs, list(more), graph
         self.backward = len(nodes) < len(inputs) and all(terms is not None for _, terms in self.terms)
         self.needed = [*nodes, *(factor for _, terms in self.terms for _, factor in terms or ())]
