@@ -737,3 +737,12 @@ def test_a_step_that_leads_out_of_the_domain_is_told_from_data_outside(scheme):
         dx.simulate(falling, scheme, q=[1.0], v=[-1.0], step=5.0, steps=3)
     with pytest.raises(ValueError, match="the data lie outside"):
         dx.simulate(falling, scheme, q=[-1.0], v=[0.0], step=0.1, steps=3)
+
+
+def test_a_part_of_a_composition_that_goes_back_in_time_is_named():
+    """ẋ = −x by the midpoint rule, 1 + h/2 = 0: in the middle part of three."""
+    decay = dx.PortHamiltonian(lambda x: x @ x / 2, np.zeros((1, 1)), R=np.ones((1, 1)))
+    back = 1 - 2 / (2 - 2 ** (1 / 3))
+    sol = dx.simulate(decay, dx.Composition(dx.DiscreteDirac(), "yoshida4"), x=[1.0], step=-2 / back, steps=3)
+    assert not sol.ok and "singular" in sol.message
+    assert "in a part of the composition that goes back in time" in sol.message and "dx.Collocation" in sol.message

@@ -21,6 +21,12 @@ from dirax.program.roots import FEWEST_SPARSE, sparse_equations
 from dirax.schemes.step import CLOCK
 from dirax.systems.circuit import POTENTIAL
 
+BACK = (
+    ", in a part of the composition that goes back in time, in which what dissipates grows: take smaller steps, or a scheme of "
+    "high order without such parts, dx.Collocation or dx.EnergyCollocation"
+)
+"""Of parts of negative length."""
+
 SMALLER = "a smaller step may help"
 
 COUNTS, NAMED = 0.1, 8
@@ -99,10 +105,11 @@ def _reason(p: Problem, outcome: Outcome, lane: int, t: float, sizes: Callable[[
         numbers, h = known[id(stage)], fraction * p.h
         guess = numbers.guess(state, last if len(last) == stage.unknowns else np.zeros(stage.unknowns), h)
         reason, u = _replay_newton(stage, numbers, guess, (state, t, h), params, size, p.max_iterations)
+        back = BACK if h < 0.0 < p.h and not reason.endswith(SMALLER) else ""
         if reason:
-            return reason + (_where_it_ends(numbers, guess, (state, t, h)) if reason.endswith(SMALLER) and alone else "")
+            return reason + back + (_where_it_ends(numbers, guess, (state, t, h)) if reason.endswith(SMALLER) and alone else "")
         if floating := _floating(stage, numbers, u, (state, t, h)):
-            return f"Newton did not converge from the values extrapolated from the steps before{floating}"
+            return f"Newton did not converge from the values extrapolated from the steps before{floating}{back}"
         solved.append((stage, numbers, guess, (state, t, h), size))
         state, t = numbers.advance(u, state, t, h), t + h
         if not np.all(np.isfinite(state)):
@@ -126,7 +133,10 @@ def _replay_newton(stage, numbers: InNumbers | InJax, guess, args, params, sizes
             return f"{label} is not finite (outside the domain of the system's functions) in Newton iteration {iteration + 1}", u
         worst = int(np.argmax(np.abs(residual)))
         if not condition < LARGEST_CONDITION:
-            dependent = _dependent(stage, numbers.linearized(u, *args)[1]) if stage.unknowns < FEWEST_SPARSE else ""
+            named = (
+                stage.unknowns < FEWEST_SPARSE and args[2] > 0.0
+            )  # back in time it may be singular where nothing is undetermined
+            dependent = _dependent(stage, numbers.linearized(u, *args)[1]) if named else ""
             return f"the Jacobian of the step is singular (condition number {condition:.2g}){dependent}", u
         change = solve(residual)
         u = u - change
