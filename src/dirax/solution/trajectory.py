@@ -340,7 +340,8 @@ class Trajectory:
 
     def _of_many(self) -> np.ndarray | None:
         """The energy at every row of a long run by machine code; None for others, and where there is none."""
-        if self.rows * (self.batch or 1) <= MANY or is_traced(self.fields, self._params):
+        in_memory = all(isinstance(values, np.ndarray) for values in self.fields.values())
+        if self.rows * (self.batch or 1) <= MANY or not in_memory or is_traced(self._params):
             return None
         from dirax.solution.energy_code import energies_of  # and its compiler, where it is used
 
