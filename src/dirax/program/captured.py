@@ -25,7 +25,6 @@ from dirax.program.outside_values import (
     ABSENT,
     LIBRARIES,
     NOT_OF_VALUES,
-    answer,
     attribute,
     beside_inner,
     contents,
@@ -172,7 +171,7 @@ class Captured:
 
     def _follow_object(self, value: Any, words: str, names: frozenset[str], depth: int) -> None:
         """By the attributes that code reads, of one of a library's or without any by what it is written as."""
-        is_object, count, asked = not isinstance(value, type | types.ModuleType), len(self.watched), names
+        is_object, count = not isinstance(value, type | types.ModuleType), len(self.watched)
         if not is_of_library(value):
             if is_object and is_installed(type(value)):
                 names = names & getattr(value, "__dict__", {}).keys()
@@ -185,10 +184,6 @@ class Captured:
                     self._follow(held, whole, names, depth + 1)
                 elif not frozen:
                     self._watch(whole, read, names, depth)
-            if is_object and not frozen and hasattr(type(value), "__getattr__"):  # boxes, whose attributes are what they say
-                for name in sorted(asked):
-                    if attribute(value, name) is ABSENT and not name.startswith("__"):
-                        self._watch(f"{words}.{name}", functools.partial(answer, value, name), names, depth)
         if is_object and len(self.watched) == count and not callable(value) and root_of(value) not in NOT_OF_VALUES:
             self._by_contents(words, lambda: written(value))
 

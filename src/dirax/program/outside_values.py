@@ -54,14 +54,6 @@ def attribute(value: Any, name: str) -> Any:
     return getattr(value, name, ABSENT) if isinstance(found, types.MemberDescriptorType) else found
 
 
-def answer(value: Any, name: str) -> Any:
-    """What an object says that an attribute is; `ABSENT` where it has none."""
-    try:
-        return getattr(value, name)
-    except Exception:  # its own, of any kind
-        return ABSENT
-
-
 def read_by(value: Any) -> frozenset[str]:
     """The methods by which an object is read, as a user's class says them."""
     kinds = [kind for kind in type(value).__mro__ if not (is_of_library(kind) or is_installed(kind))]
