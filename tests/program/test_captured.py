@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
+import xarray as xr
 
 import dirax as dx
 from dirax.program.captured import Captured
@@ -531,4 +532,15 @@ def test_ways_to_read_a_number(lagrangian):
     for old in systems:
         with pytest.raises(ValueError, match=r"reads .*(k|defined_later).*, which was 1\.0 .* and is 4\.0 now"):
             end(old)
+    assert end(dx.LagrangeDirac(lagrangian)) == pytest.approx(np.cos(2.0), abs=1e-5)
+
+
+def test_datasets_make_new_arrays_of_the_same_numbers():
+    data = xr.Dataset({"k": ("x", [1.0, 2.0])})
+    lagrangian = lambda q, v: v @ v / 2 - data.k.values[0] * q @ q / 2
+    system = dx.LagrangeDirac(lagrangian)
+    assert [end(system), end(system)] == pytest.approx([np.cos(1.0)] * 2, abs=1e-6)
+    data.k.values[0] = 4.0
+    with pytest.raises(ValueError, match=r"lagrangian reads .*k"):
+        end(system)
     assert end(dx.LagrangeDirac(lagrangian)) == pytest.approx(np.cos(2.0), abs=1e-5)

@@ -6,6 +6,7 @@ or an entry of an array would be seen by no later run, so that runs ask whether 
 
 import argparse
 import builtins
+import contextlib
 import functools
 import itertools
 import sys
@@ -294,6 +295,11 @@ def _alike(now: Any, before: Any) -> bool:
         return np.asarray(now).tobytes() == np.asarray(before).tobytes()
     if type(now) is not type(before):
         return False
+    if hasattr(now, "__array__"):  # those of other libraries, which make new ones where they are asked for the same
+        with contextlib.suppress(Exception):
+            one, other = np.asarray(now), np.asarray(before)
+            if one.dtype != object and other.dtype != object:
+                return _alike(one, other)
     if type(now) is tuple:
         return len(now) == len(before) and all(x is y or _alike(x, y) for x, y in zip(now, before, strict=True))
     if type(now) is dict:
