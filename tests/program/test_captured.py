@@ -544,3 +544,56 @@ def test_datasets_make_new_arrays_of_the_same_numbers():
     with pytest.raises(ValueError, match=r"lagrangian reads .*k"):
         end(system)
     assert end(dx.LagrangeDirac(lagrangian)) == pytest.approx(np.cos(2.0), abs=1e-5)
+
+
+class Body:
+    def __init__(self, k, parts=()):
+        self.k, self.parts = k, list(parts)
+
+    def total(self):
+        return self.k + sum(part.total() for part in self.parts)
+
+
+class Law:
+    def potential(self, body, q):
+        return body.k * q @ q / 2
+
+
+def deep(levels):
+    leaf = root = Body(0.25)
+    for _ in range(levels):
+        root = Body(0.0, [root])
+    return leaf, root
+
+
+LEAF, TREE = deep(3)
+FAR_LEAF, TALL_TREE = deep(20)
+MANY_BODIES, LAW, BODY, NUMBERS = [Body(0.25 / 512) for _ in range(512)], Law(), Body(0.25), [0.25 / 512] * 512
+HANDED = functools.partial(lambda body, q: body.k * q @ q / 2, BODY)
+
+
+@pytest.mark.parametrize(
+    "lagrangian",
+    [
+        lambda q, v: v @ v / 2 - (0.75 + TREE.total()) * q @ q / 2,
+        lambda q, v: v @ v / 2 - (0.75 + TALL_TREE.total()) * q @ q / 2,
+        lambda q, v: v @ v / 2 - (0.75 + sum(body.k for body in MANY_BODIES)) * q @ q / 2,
+        lambda q, v: v @ v / 2 - (0.75 + sum(NUMBERS)) * q @ q / 2,
+        lambda q, v: v @ v / 2 - 0.75 * q @ q / 2 - LAW.potential(BODY, q),
+        lambda q, v: v @ v / 2 - 0.75 * q @ q / 2 - HANDED(q),
+    ],
+    ids=["a tree", "a tall tree", "many", "many numbers", "a method of another object", "partial"],
+)
+def test_a_system_that_is_stated_anew_has_the_numbers_of_now(lagrangian):
+    """Also where there is too much, or too deep in other objects, to be watched."""
+    before = [(holder, holder.k) for holder in (LEAF, FAR_LEAF, MANY_BODIES[-1], BODY)]
+    assert end(dx.LagrangeDirac(lagrangian)) == pytest.approx(np.cos(1.0), abs=1e-6)
+    try:
+        for holder, k in before:
+            holder.k = k + 3.0
+        NUMBERS[-1] += 3.0
+        assert end(dx.LagrangeDirac(lagrangian)) == pytest.approx(np.cos(2.0), abs=1e-5)
+    finally:
+        for holder, k in before:
+            holder.k = k
+        NUMBERS[-1] = NUMBERS[0]

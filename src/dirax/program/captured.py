@@ -42,11 +42,14 @@ from dirax.program.outside_values import (
     written,
 )
 
-DEEPEST, MOST = 6, 400
+DEEPEST, MOST = 10, 400
 """How far values are followed, and how many are watched."""
 
 COPIED, LARGEST = 2**20, 2**28
 """Bytes of an array up to which its entries are compared, and up to which a digest of them, a second for a thousand million."""
+
+LONG = 32
+"""Numbers of a list from which on they are compared together."""
 
 SPACES = types.SimpleNamespace, argparse.Namespace
 """Objects that are but their attributes."""
@@ -83,6 +86,8 @@ class Captured:
         self.watched: list[Watched] = []
         self.stale = ""
         """What a function reads that JAX has traced before, and keeps, with another value."""
+        self.whole = True
+        """Whether nothing was left out that lies too deep, or is too much: else it is not known that nothing has changed."""
         self._seen: set[int] = set()
         self._follow(function, "", _methods_of(function) if isinstance(function, type) else frozenset(), 0)
         del self._seen
@@ -122,14 +127,20 @@ class Captured:
     def _watch(self, words: str, read: Callable[[], Any], names: frozenset[str], depth: int, filled: bool = True) -> None:
         """`filled`: a name without a value is none, and does not get one."""
         value = read()
-        if (value is ABSENT and filled) or len(self.watched) >= MOST:
+        if value is ABSENT and filled:
+            return
+        if len(self.watched) >= MOST:
+            self.whole &= isinstance(value, (*PLAIN, jax.Array))
             return
         self.watched.append(Watched(words, read, value))
         self._follow(value, words, names, depth + 1)
 
     def _follow(self, value: Any, words: str, names: frozenset[str], depth: int) -> None:
         """What can change of a value while it stays the same object; `names` are the attributes that code reads."""
-        if depth > DEEPEST or isinstance(value, (*PLAIN, jax.Array, Tracer)) or id(value) in self._seen:
+        if isinstance(value, (*PLAIN, jax.Array, Tracer)) or id(value) in self._seen:
+            return
+        if depth > DEEPEST:
+            self.whole = False
             return
         self._seen.add(id(value))
         if isinstance(value, np.ndarray) and value.dtype != object:
@@ -138,6 +149,8 @@ class Captured:
             elif value.nbytes <= LARGEST:
                 self._by_contents(f"the array {words}", lambda: np.ascontiguousarray(value))
         elif isinstance(value, functools.partial):
+            called = inner(value.func)
+            names = names | _attributes(called, set()) if isinstance(called, types.FunctionType) else names
             for part in (value.func, *value.args, *value.keywords.values()):
                 self._follow(part, words, names, depth + 1)
         elif isinstance(value, types.MethodType):
@@ -152,6 +165,7 @@ class Captured:
         elif isinstance(value, types.FunctionType):
             self._follow_function(value, words or value.__name__, depth)
         elif isinstance(value, Mapping):
+            self.whole &= len(value) <= MOST
             keys = lambda: [*itertools.islice(value, MOST)]
             self.watched.append(Watched(f"the keys of {words}", keys, keys()))
             for key in keys():
@@ -159,7 +173,10 @@ class Captured:
         elif isinstance(value, tuple):
             for i, part in enumerate(value[:MOST]):
                 self._follow(part, f"{words}[{i}]", names, depth + 1)
+        elif isinstance(value, list) and len(value) > LONG and all(isinstance(part, PLAIN) for part in value):
+            self._by_contents(f"the list {words}", lambda: repr(value).encode())
         elif isinstance(value, list):
+            self.whole &= len(value) <= MOST
             self.watched.append(Watched(f"the length of {words}", lambda: len(value), len(value)))
             for i in range(min(len(value), MOST)):
                 self._watch(f"{words}[{i}]", functools.partial(item, value, i), names, depth)
@@ -240,7 +257,11 @@ def _attributes(function: types.FunctionType, seen: set[int]) -> frozenset[str]:
     seen.add(id(function))
     found = reads(function.__code__).others
     for _, read in _outside(function):
-        for other in _functions_among(read()):
+        value = read()
+        known = isinstance(value, type | types.ModuleType | types.FunctionType) or is_of_library(value)
+        if not known and not is_installed(type(value)):
+            found |= with_methods(value, found)  # which may be handed other objects
+        for other in _functions_among(value):
             if id(other) not in seen and package_of(other) not in LIBRARIES | {"dirax"}:
                 found |= _attributes(other, seen)
     return found

@@ -53,7 +53,7 @@ def as_stated(function: Callable) -> Stated:
     of_values = is_of_values(function)
     known = _stated.get(key_of(function, 0) if of_values else function, list)
     for was, stands in known:
-        if not was.changed():
+        if was.whole and not was.changed():
             return Stated(was if stands is function else Captured(function), was, stands)
     captured, stands = Captured(function), held(function, 0) if of_values else function
     if stands is function and (known or (isinstance(function, types.FunctionType) and function in _standing)):
