@@ -130,3 +130,30 @@ def test_each_one_form_may_have_a_unit_of_its_own(scheme):
         return sol.q[-1]
 
     np.testing.assert_allclose([last(1e12), last(1e-13)], [last(1.0)] * 2, atol=1e-12)
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1e-12])
+def test_method_2_takes_a_regular_lagrangian_in_any_units(unit):
+    def motion(e):
+        kinetic = lambda v: v[0] ** 2 / 2 + e**2 * v[1] ** 2 / 2 + 0.2 * e * v[0] * v[1]
+        system = dx.LagrangeDirac(lambda q, v: kinetic(v) - q[0] ** 2 / 2 - e**2 * q[1] ** 2 / 2)
+        run = {"q": [0.3, 0.2 / e], "v": [0.1, 0.4 / e], "step": 0.05, "steps": 50}
+        return dx.simulate(system, dx.DiscreteDirac(constraints="resolve"), **run).q * [1.0, e]
+
+    np.testing.assert_allclose(motion(unit), motion(1.0), atol=1e-12)
+
+
+@pytest.mark.parametrize("theta", [0.3, 0.5])
+def test_twins_of_a_hamiltonian_have_one_verdict(theta):
+    hamiltonian, matrix = lambda x: x @ x / 2 + x[0] ** 4 / 4, np.array([[0.0, 1.0], [-1.0, 0.0]])
+    of_q = lambda q, p: hamiltonian(jnp.concatenate([q, p]))
+    twins = {
+        dx.DiracSystem(dx.induced_dirac(None, 1), hamiltonian): {"x": [0.3, 0.2]},
+        dx.PortHamiltonian(hamiltonian, matrix): {"x": [0.3, 0.2]},
+        dx.HamiltonDirac(of_q): {"q": [0.3], "p": [0.2]},
+    }
+    for system, data in twins.items():
+        sol = dx.simulate(system, dx.DiscreteDirac(dx.Theta(theta)), **data, step=0.1, steps=20)
+        line = dx.verify(sol)["symplecticity of one step"]
+        assert line.verdict == ("ok" if theta == 0.5 else "not checked")
+        assert ("is not symplectic" in line.explanation) == (theta != 0.5)

@@ -337,3 +337,10 @@ def test_on_a_sphere():
     q = sol.q.copy()
     q[50] += 1e-8 * np.array([0.8, 0.0, 0.6])
     assert replayed(sol.replace(fields=sol.fields | {"q": q}), None).verdict == "VIOLATED"
+
+
+def test_constraints_that_follow_from_others_are_named():
+    twice = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[1], holonomic=lambda q: jnp.array([1.0, 2.0]) * (q @ q - 1.0))
+    with pytest.raises(ValueError, match=r"must not follow from others, as number 1 does .*: leave it out"):
+        scheme = dx.VariableSteps(dx.LagrangeDAlembert(), lambda q: 1 + q @ q)
+        dx.simulate(twice, scheme, q=[0.6, -0.8], v=[0.0, 0.0], step=0.05, steps=3)

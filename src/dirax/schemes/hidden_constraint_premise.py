@@ -7,11 +7,11 @@ from collections.abc import Callable
 import jax.numpy as jnp
 import numpy as np
 
+from dirax.numerics.ranks import rank_of_equations
 from dirax.program.tracing import gradient, jacobian
 from dirax.program.user_functions import evaluated
 from dirax.schemes.step import StepEquation
 from dirax.systems.constraint_algorithm import final_manifold_needed
-from dirax.systems.constraint_search import rank_of
 from dirax.systems.forms import RelationForm
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.manifold_lagrangian import ManifoldLagrangian
@@ -63,7 +63,7 @@ def _refusing(system: AbstractSystem, at: Callable, equation: StepEquation, sche
 
     def refuse(found, params):
         matrix, what, near = np.asarray(found[0]), *found[1:]
-        rank = rank_of(matrix)
+        rank = int(rank_of_equations(matrix[None])[0][0])
         if rank < max(matrix.shape):
             raise ValueError(
                 f"{what} has rank {rank} of {max(matrix.shape)} at the initial data, and {scheme} of this "

@@ -60,8 +60,18 @@ def with_sizes(change: Array, form: Array, jacobian: Array) -> Float[Array, "2 s
     return jnp.stack([change, jnp.maximum(sizes, jnp.outer(lengths, lengths))])
 
 
+def not_symplectic(theta: float | None) -> str:
+    """Why a step of ẋ ⊕ dH ∈ D by a θ map may change the form; "" for the midpoint rule, and where there is no θ."""
+    return "" if theta in (0.5, None) else f"; the map with θ = {theta} is not symplectic ([BLM] Remark 6.4)"
+
+
 class CanonicalForm(RowForm):
     """JᵀΩJ = Ω for J = ∂(q', p')/∂(q, p): the step is symplectic."""
+
+    theta: float | None = eqx.field(static=True, default=None)
+
+    def excuse(self, numbers: Any) -> str:
+        return not_symplectic(self.theta)
 
     @property
     def reads(self) -> tuple[str, ...]:
@@ -97,7 +107,7 @@ class FormOfPoints(RowForm):
     def excuse(self, numbers: Any) -> str:
         if numbers[1] > CONSTANT:
             return "; it changes from point to point, and such methods preserve constant ones ([BLM] Proposition 6.3)"
-        return "" if self.theta in (0.5, None) else f"; the map with θ = {self.theta} is not symplectic ([BLM] Remark 6.4)"
+        return not_symplectic(self.theta)
 
     def at_both_ends(self, step: DifferentiatedStep, equation: Any, rows: Data, params: Any) -> tuple[Array, Array, Array]:
         """(the form at x, that at Φ(x), ∂Φ/∂x)."""
@@ -209,7 +219,8 @@ def form_of_steps(
     if canonical and shape.m + shape.c:
         return "steps under constraints may be symplectic on the manifold of these alone, of which the rows hold no multipliers"
     if canonical:
-        return (CanonicalPoints if "x" in fields else CanonicalForm)(system, step)
+        lifted = isinstance(structure, str) or system.lagrangian_form() is not None  # by the lift of the map to T*Q
+        return (CanonicalPoints if "x" in fields else CanonicalForm)(system, step, None if lifted else structure.theta)
     if (on_manifold := system.manifold_form()) is not None:
         if "chart" in fields:
             return ChartedForm(system, step)

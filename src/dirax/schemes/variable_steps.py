@@ -49,6 +49,12 @@ class VariableSteps(AbstractScheme):
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:
         if system.quotient_form() is not None:
             raise TypeError("dx.VariableSteps takes systems that are not reduced.")
+        if shape.redundant:
+            raise ValueError(
+                "dx.VariableSteps asks for velocities of momenta, for which constraints must not follow from others, as number "
+                f"{', '.join(map(str, shape.redundant))} does (in the order of the multipliers: one_forms, then holonomic): "
+                "leave it out of the system."
+            )
         # momenta that are means over both steps at a row are those of equal steps: as in compositions
         inner = make_step_equation(self.scheme.part(system, shape), system, shape)
         if not isinstance(inner, StepEquation):
