@@ -81,3 +81,20 @@ def test_the_line_of_verify_sees_a_path_that_is_no_solution():
     assert moved.verdict == "VIOLATED" and moved.value > 1e-8
     with pytest.raises(TypeError, match="must be a dirax Solution"):
         dx.action_sum(3)
+
+
+@pytest.mark.parametrize("unit", [1.0, 2.0**-20, 2.0**-34])
+def test_variations_are_admissible_in_any_unit_of_a_coordinate(unit):
+    """With a holonomic constraint beside a one-form, whose rows are nearly parallel where one coordinate has a small unit."""
+    sizes = np.array([1.0, 1.0 / unit, 1.0])
+    lagrangian = lambda q, v: v @ v / 2 + 0.2 * v[0] * v[1] - q @ q / 2 - 0.1 * jnp.sum(q**4)
+    system = dx.LagrangeDirac(
+        lambda q, v: lagrangian(q * sizes, v * sizes),
+        lambda q: jnp.array([[1.0, q[2], 0.3]]) * sizes[None],
+        holonomic=lambda q: jnp.array([(q * sizes) @ (q * sizes) - 1.0]),
+    )
+    q = np.array([0.3, 0.2, 0.1]) / np.linalg.norm([0.3, 0.2, 0.1])
+    start = {"q": q / sizes, "v": np.array([0.1, 0.4, 0.2]) / sizes, "project": True}
+    sol = dx.simulate(system, dx.LagrangeDAlembert(), **start, step=0.05, steps=60)
+    line = dx.verify(sol)["action sum stationary"]
+    assert line.verdict == "ok" and line.value < 1e-15

@@ -83,8 +83,9 @@ def stationary_action(solution: Solution, structure: Any, tolerance: float | Non
     items = consecutive(solution, ("q",), 3, inner)
     moved = np.abs(np.diff(items["q"], axis=axis + 1))
     moved = np.nanmax(moved, axis=tuple(range(moved.ndim - 1)), initial=0.0)  # the units of each coordinate
-    along = np.where(moved > 0.0, moved, 1.0) * np.random.default_rng(0).normal(size=np.take(items["q"], 1, axis=axis + 1).shape)
-    varied, items = eqx.Partial(_varied, structure), (items, along)
+    units = np.where(moved > 0.0, moved, 1.0)
+    along = units * np.random.default_rng(0).normal(size=np.take(items["q"], 1, axis=axis + 1).shape)
+    varied, items = eqx.Partial(_varied, structure), (items, along, np.broadcast_to(units, along.shape))
     terms, limit = over_rows(varied, solution, items), roundoff_limit(tolerance, 1)
     value, size = np.nansum(terms, axis=1).T
     if np.any(np.abs(value) > limit * size):  # what cancels inside of D L_d, as differences of q over h, may be much larger
@@ -102,7 +103,7 @@ def _varied_items(structure: AbstractPairs, solution: Solution, variation: Any) 
     inner = np.arange(solution.rows - 2)
     items = consecutive(solution, ("q",), 3, inner)
     along = np.take(np.asarray(variation, float), inner + 1, axis=np.ndim(solution.q) - 2)
-    return eqx.Partial(_varied, structure), (items, along)
+    return eqx.Partial(_varied, structure), (items, along, np.ones_like(along))
 
 
 def _pairs(solution: Solution) -> AbstractPairs:
@@ -148,11 +149,12 @@ def _minus_energy(of, rows, params):
     return -pairs.slots(rows["t"][0], q0, q1, params)[0] @ (q1 - q0) - _lagrangian(pairs, rows, params)
 
 
-def _varied(of, rows, along, params):
-    """(the term of the inner row, the sum of its sizes)."""
+def _varied(of, rows, along, units, params):
+    """(the term of the inner row, the sum of its sizes); the variation is put on the constraints in these units of q."""
     pairs, rows, params = of.in_coordinates(rows | {"along": along}, 1, params)
     along, t, (q0, q1, q2) = rows["along"], rows["t"], rows["q"]
     arriving, leaving = pairs.slots(t[0], q0, q1, params)[1], pairs.slots(t[1], q1, q2, params)[0]
-    admissible = along - pairs.outside(t[1], q1, along, params)
+    units = units if pairs is of else jnp.ones_like(along)  # of charts they are others
+    admissible = pairs.admissible(t[1], q1, along, units, params)
     sizes = (jnp.abs(arriving) + jnp.abs(leaving)) @ jnp.abs(admissible)
     return jnp.stack([(arriving + leaving) @ admissible, sizes])

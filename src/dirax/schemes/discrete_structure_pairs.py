@@ -115,6 +115,12 @@ class LagrangianPairs(AbstractPairs):
         """The part of a vector or covector in Δ°_Q(q)."""
         return self.annihilator(t, q, params) @ vector if self._constrained else jnp.zeros_like(vector)
 
+    def admissible(self, t: Any, q: Vector, vector: Vector, units: Vector, params: Any) -> Vector:
+        """The vector of Δ_Q(q) that is nearest to one in these units of the coordinates."""
+        if not self._constrained:
+            return vector
+        return vector - units * (annihilator_projector(self.matrix(t, q, params) * units[None, :]) @ (vector / units))
+
     # ------------------------------------------------------------------ AbstractDiscreteStructure
 
     @property
