@@ -174,7 +174,7 @@ class Captured:
             for i, part in enumerate(value[:MOST]):
                 self._follow(part, f"{words}[{i}]", names, depth + 1)
         elif isinstance(value, list) and len(value) > LONG and all(isinstance(part, PLAIN) for part in value):
-            self._by_contents(f"the list {words}", lambda: repr(value).encode())
+            self.watched.append(Watched(f"the list {words}", lambda: value, list(value)))
         elif isinstance(value, list):
             self.whole &= len(value) <= MOST
             self.watched.append(Watched(f"the length of {words}", lambda: len(value), len(value)))
