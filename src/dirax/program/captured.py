@@ -171,6 +171,7 @@ class Captured:
             for key in keys():
                 self._watch(f"{words}[{key!r}]", functools.partial(item, value, key), names, depth)
         elif isinstance(value, tuple):
+            self.whole &= len(value) <= MOST
             for i, part in enumerate(value[:MOST]):
                 self._follow(part, f"{words}[{i}]", names, depth + 1)
         elif isinstance(value, list) and len(value) > LONG and all(isinstance(part, PLAIN) for part in value):
