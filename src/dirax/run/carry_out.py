@@ -231,7 +231,7 @@ def _begun(settings: Settings, case: Case, steps: int, save_every: int, asked: i
             check(first, case.h, own)
         needed = partial(needed_at, system, case, initial) if singular else None
         labels = equation.stages[0][0].labels
-        shorter = lambda: begun(equation, replace(case, h=SHORTER * case.h), initial, by_jax).jacobian
+        shorter = lambda: begun(equation, replace(case, h=SHORTER * case.h), initial, by_jax)
         refuse_bad_start(system, initial, start, labels, check_initial, settings.project, needed, case, shorter)
         if check_initial and singular:
             refuse_off_final_manifold(system, case, initial)

@@ -33,12 +33,12 @@ def refuse_bad_start(
     projected: bool,
     needed: Callable[[], str] | None,
     case: Case,
-    shorter: Callable[[], Any],
+    shorter: Callable[[], Start],
 ) -> None:
     """Raise `ValueError` for functions that are not finite at the data, data off the constraints (with the residual), and a
     first step without a unique solution (with the rank of the matrix (21) of [PY]). `labels` are those of
     the equations of the first step; `projected` says that the data have been moved, `needed` what a singular Lagrangian needs.
-    `shorter` gives the Jacobian of a first step SHORTER times as long: a matrix that is singular at the first guess of a long
+    `shorter` gives the start of a first step SHORTER times as long: a matrix that is singular at the first guess of a long
     step alone may just be far from the solution."""
     if start.row0 is not None and "constraint" in start.row0:
         both = _lanes(initial.defect, 1), _lanes(start.row0["constraint"], 1)
@@ -121,7 +121,7 @@ def _refuse_singular_step(
     labels: Sequence[str],
     needed: Callable[[], str] | None,
     lagrangian: bool,
-    shorter: Callable[[], Any] | None,
+    shorter: Callable[[], Start] | None,
     outside: str,
 ) -> None:
     residual, sparse = _lanes(start.residual, 1), isinstance(start.jacobian, SparseJacobians)
@@ -135,7 +135,7 @@ def _refuse_singular_step(
                 f"and this scheme {needed()}."
             )
         lane = int(np.argmin(finite))
-        if shorter and not sparse and np.all(np.isfinite(_lanes(shorter(), 2)[lane])):
+        if shorter and not sparse and np.all(np.isfinite(_lanes(shorter().residual, 1)[lane])):
             outside = "the step is too long: it leads out of the domain of the system's functions, and a shorter one does not"
         row = int(np.argmin(rows[lane]))
         raise ValueError(f"the first step is not finite at the initial data{_which(~finite)} (in {labels[row]}): {outside}.")
@@ -144,7 +144,7 @@ def _refuse_singular_step(
     ranks, directions = rank_of_equations(jacobian)
     unknowns = jacobian.shape[1]
     if shorter and np.any(ranks < unknowns):
-        ranks = np.maximum(ranks, _ranks_where_finite(_lanes(shorter(), 2)))
+        ranks = np.maximum(ranks, _ranks_where_finite(_lanes(shorter().jacobian, 2)))
     if np.any(ranks < unknowns):
         lane = int(np.argmax(ranks < unknowns))
         way = (
@@ -197,9 +197,7 @@ def _projection_alone(jacobian: np.ndarray, labels: Sequence[str]) -> bool:
     return steps < len(labels) and int(rank_of_equations(jacobian[None, :steps, :steps])[0][0]) == steps
 
 
-def _refuse_singular_sparse_step(
-    jacobians: SparseJacobians, labels: Sequence[str], shorter: Callable[[], SparseJacobians] | None
-) -> None:
+def _refuse_singular_sparse_step(jacobians: SparseJacobians, labels: Sequence[str], shorter: Callable[[], Start] | None) -> None:
     """The same of many unknowns, of which only some are named: those that move most in the direction that is left free.
 
     That the pattern has all entries is checked by a product with a vector that was not found with it."""
@@ -216,7 +214,7 @@ def _refuse_singular_sparse_step(
             if np.any(worst > PRODUCT):
                 raise AssertionError(f"the {what} of the step is wrong in {labels[int(np.argmax(worst))]}: report this.")
         free = _free_direction(jacobians, lane)
-        if free is None or (shorter and _free_direction(shorter(), lane) is None):
+        if free is None or (shorter and _free_direction(shorter().jacobian, lane) is None):
             continue
         most = np.argsort(-np.abs(free))[:4]
         most = most[np.abs(free[most]) > 1e-3 * np.abs(free[most[0]])]
