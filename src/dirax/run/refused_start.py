@@ -135,7 +135,7 @@ def _refuse_singular_step(
                 f"and this scheme {needed()}."
             )
         lane = int(np.argmin(finite))
-        if shorter and not sparse and np.all(np.isfinite(_lanes(shorter().residual, 1)[lane])):
+        if shorter and not sparse and _is_finite(shorter(), lane):
             outside = "the step is too long: it leads out of the domain of the system's functions, and a shorter one does not"
         row = int(np.argmin(rows[lane]))
         raise ValueError(f"the first step is not finite at the initial data{_which(~finite)} (in {labels[row]}): {outside}.")
@@ -182,6 +182,12 @@ def _refuse_singular_step(
             f"initial data{_which(ranks < unknowns)}, and leaves the direction "
             f"{free} of the unknowns free. {way}."
         )
+
+
+def _is_finite(start: Start, lane: int) -> bool:
+    """Whether the equations of a first step of a trajectory, and their derivatives, are finite."""
+    arrays = _lanes(start.residual, 1)[lane], _lanes(start.jacobian, 2)[lane]
+    return all(np.all(np.isfinite(a)) for a in arrays)
 
 
 def _ranks_where_finite(jacobians: np.ndarray) -> np.ndarray:
