@@ -21,7 +21,6 @@ KINDS = {
 
 NAMES = {"LOAD_GLOBAL", "LOAD_NAME", "LOAD_DEREF", "LOAD_CLASSDEREF", "LOAD_FROM_DICT_OR_DEREF"}
 
-
 BY_TEXT = {"getattr", "attrgetter", "vars", "__dict__"}
 """By which attributes are read whose names are texts."""
 
@@ -45,8 +44,10 @@ class Reads(NamedTuple):
 @functools.lru_cache(maxsize=1024)
 def reads(code: types.CodeType) -> Reads:
     """Of code and of the functions inside it."""
-    names: dict[str, set[str]] = {"LOAD_GLOBAL": set(), "LOAD_ATTR": set(), "STORE": set(), "CHANGED": _changed(code)}
-    names["IMPORT_NAME"] = set()
+    names: dict[str, set[str]] = {
+        **{"LOAD_GLOBAL": set(), "LOAD_ATTR": set(), "STORE": set()},
+        **{"CHANGED": _changed(code), "IMPORT_NAME": set()},
+    }
     for i in dis.get_instructions(code):
         if (place := KINDS.get(i.opname, i.opname)) in names:
             names[place].add(i.argval)

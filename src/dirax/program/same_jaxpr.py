@@ -43,10 +43,10 @@ def _with_own_arrays(jaxpr: Jaxpr) -> Jaxpr:
 
 def _of_equation(equation: Any) -> Any:
     params = {name: _own(value) for name, value in equation.params.items()}
-    atoms = [Literal(_own(a.val), a.aval) if isinstance(a, Literal) and _own(a.val) is not a.val else a for a in equation.invars]
+    is_array = lambda atom: isinstance(atom, Literal) and isinstance(atom.val, np.ndarray)
+    atoms = [Literal(a.val.copy(), a.aval) if is_array(a) else a for a in equation.invars]
     same = all(params[name] is value for name, value in equation.params.items())
-    same = same and all(a is b for a, b in zip(atoms, equation.invars, strict=True))
-    return equation if same else equation.replace(params=params, invars=atoms)
+    return equation if same and not any(map(is_array, atoms)) else equation.replace(params=params, invars=atoms)
 
 
 def _own(value: Any) -> Any:

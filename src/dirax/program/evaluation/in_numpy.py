@@ -19,6 +19,10 @@ MORE_LANES, MOST_VALUES = 4 * LANES, 2**24
 """Entries at a time of a graph with few nodes, where what an operation takes is Python's, and the values there may be then."""
 
 
+PARTIALS = 4
+"""Nodes, at most, for the derivatives of one operation by its operands, and the operation."""
+
+
 class Values:
     """What nodes of a graph are at some entries; operands are computed where something needs them."""
 
@@ -147,10 +151,6 @@ class Slopes:
         if len(self.order.nodes) < FEWEST_NODES or not compiles():
             return None
         return RowTape(self.graph, self.nodes, self.inputs, self.more, self.terms, self.needed, self.backward)
-
-
-PARTIALS = 4
-"""Nodes, at most, for the derivatives of one operation by its operands, and the operation."""
 
 
 def lanes_of(graph: Graph) -> int:
